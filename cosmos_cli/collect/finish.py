@@ -15,17 +15,17 @@ import dataclasses
 import datetime
 import errno
 import json
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from cosmos_cli.collect.finished_run import refuse_living
 from cosmos_cli.collect.machine_sources import RecordingMachines
 from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.unread_files import find_unread, told_unread
-from cosmos_cli.errors import ExitCode, InputError, RunFailedError
+from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.evidence.completeness import HOST, ExpectedRecords, find_missing, mapping_at
 from cosmos_cli.evidence.devices import expected_devices, read_devices
 from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
@@ -48,16 +48,11 @@ from cosmos_cli.evidence.tick_causes import recorded_causes
 from cosmos_cli.evidence.timeline_remarks import timeline_remarks
 from cosmos_cli.evidence.told_counts import with_told_counts
 from cosmos_cli.evidence.verdict import Verdict
-from cosmos_cli.onboard.processes import words_of
 from cosmos_cli.report.html import write_report
-from cosmos_cli.ui.name_ranges import compact
-from cosmos_cli.ui.plural import counted
 from madns_runtime.hardware.action_socket import SOCKET_NAME as ACTIONS_SOCKET
 from madns_runtime.hardware.order_socket import SOCKET_NAME as ORDERS_SOCKET
 from madns_runtime.processes import ProcessEntry, list_processes
 
-PROCESSES_SHOWN_MAX = 3
-_SEVERAL_NAMES = re.compile(r"([^\s,]+),(?:\S+,)?([^\s,]+)(?= \(pid )")
 """Of a process that holds several agents: their names with commas."""
 LivingProcesses = Callable[[], Sequence[ProcessEntry]]
 
@@ -224,43 +219,6 @@ def _expected(
     machines = (*planned.machines, *earlier.sources("machines"))
     return dataclasses.replace(
         planned, agents=tuple(dict.fromkeys(agents)), machines=tuple(dict.fromkeys(machines))
-    )
-
-
-def refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None:
-    """
-    See that nothing of a run lives on this computer.
-
-    Raises:
-        InputError: It does; the message names who.
-    """
-    living = [
-        words_of(entry)
-        for entry in processes
-        if Path(entry.run_directory).resolve().is_relative_to(run.path)
-    ]
-    if living:
-        raise still_running(run.name, {"": living})
-
-
-def still_running(run: str, living: Mapping[str, Sequence[str]]) -> InputError:
-    """
-    Return the refusal to touch a run that still lives: where, how many processes, and what to do.
-
-    Args:
-        run: The run's name.
-        living: In words, the processes on each machine; this computer's name is empty.
-    """
-    machines = compact(name for name in living if name)
-    where = f" on {machines}" if machines else ""
-    processes = [words for there in living.values() for words in there]
-    shown = ", ".join(
-        _SEVERAL_NAMES.sub(r"\1 ... \2", text) for text in processes[:PROCESSES_SHOWN_MAX]
-    )
-    if len(processes) > PROCESSES_SHOWN_MAX:
-        shown = f"{counted(len(processes), 'process')}, such as {shown}"
-    return InputError(
-        f"{run} is still running{where}: {shown}; wait for its end, or end it with: cosmos down {run}"
     )
 
 

@@ -134,6 +134,11 @@ def capacity(
     _refuse_own_settings(settings, trials)
     own = trials.overrides(first)
     checked = load_scenario(scenario or SCENARIO, [*settings, *own], warn=console.warn)
+    if checked.scenario.time.is_lockstep:
+        raise InputError(
+            f"{checked.path}: in lockstep no tick is ever missed, so that any number of agents keeps the budget; try it"
+            " in real time: --set time.mode=realtime"
+        )
     predicted = predict(checked, machines, per_process=per_process)
     options = run_arguments(inventory=inventory, limit=limit, host=host, settings=settings)
     options += ["--runs", str(runs_root(runs))]

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.collect.finish import collect_run, refuse_living, still_running
+from cosmos_cli.collect.finish import collect_run
+from cosmos_cli.collect.finished_run import refuse_living, still_running
 from cosmos_cli.collect.machine_retrieval import Retrieved
 from cosmos_cli.collect.retrieval_state import NONE, forget, forgotten_problems
 from cosmos_cli.collect.retrieve import Retrieval, problems_of

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.collect.finish import refuse_living
+from cosmos_cli.collect.finished_run import collected_document, refuse_living
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.expectations.judge import JudgedExpectations
@@ -89,11 +89,7 @@ def judge(
 
 def _collected(run: RunDirectory) -> Mapping[str, Any]:
     refuse_living(run, list_processes())
-    document = run.read_json(run.run_json)
-    if document is None or document.get("status") == "running":
-        raise InputError(
-            f"{run.name} is not collected yet; do that with: cosmos collect {run.shell_path}"
-        )
+    document = collected_document(run, str(run.path))
     if fault := fault_of_summary(document):
         raise InputError(
             f"{run.run_json}: {fault}; make it anew with: cosmos collect {run.shell_path}"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from cosmos_cli.collect.finished_run import collected_document
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import runs_root
@@ -33,11 +33,7 @@ def report(
     """Show what a run recorded: verdict, checks, tables; figures are in report.html of the run."""
     console = Console(json=as_json, quiet=quiet)
     found = find_run(runs_root(folder), run)
-    document = found.read_json(found.run_json)
-    if document is None or document.get("status") == "running":
-        raise InputError(
-            f"{found.name} is not collected yet; do that with: cosmos collect {shlex.quote(run)}"
-        )
+    document = collected_document(found, run)
     fault = fault_of_summary(document)
     if fault is not None:
         raise InputError(

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from cosmos_cli.collect.finished_run import collected_document
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.diff.compare import Selection, compare
 from cosmos_cli.diff.side import open_side
@@ -29,7 +30,6 @@ from cosmos_cli.rerun.flown_software import (
 from cosmos_cli.rerun.outcome import RerunOutcome, print_outcome
 from cosmos_cli.rerun.recorded_run import (
     FlownRun,
-    check_collected,
     read_recorded_run,
     scenario_folder,
 )
@@ -77,7 +77,7 @@ def rerun(
     with ExitStack() as stack:
         software = as_recorded_from
         if as_recorded:
-            check_collected(found, run)
+            collected_document(found, run)
             software = stack.enter_context(recorded_software(found, scenario_folder(found)))
         recorded = read_recorded_run(found, run, software)
         if as_recorded:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from cosmos_cli.collect.finished_run import collected_document
 from cosmos_cli.collect.host_tables import NAME, layout_with, tabulated, times_of, write_table
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import alone, runs_root
+from cosmos_cli.evidence.run_documents import fault_of_plan
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.models.agent_labels import AgentLabels
@@ -58,10 +59,11 @@ def tabulate(
             f"--output {output}: the table is a Parquet file; expected a name such as {output.stem}.parquet"
         )
     found = find_run(runs_root(folder), run)
-    config, document = found.read_config(), found.read_json(found.run_json)
-    if config is None or document is None or document.get("status") == "running":
+    document, config = collected_document(found, run), found.read_config()
+    if config is None:
+        fault = fault_of_plan(found.plan_json) or "cannot be used"
         raise InputError(
-            f"{found.name} is not collected yet; do that with: cosmos collect {shlex.quote(run)}"
+            f"{found.plan_json}: {fault}; put it back as it was: how its records are read stands there alone"
         )
     ran_s = document.get("duration_s")
     times_s = times_of(config, ran_s if isinstance(ran_s, int | float) else None, rate_hz)

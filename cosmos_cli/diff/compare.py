@@ -257,7 +257,13 @@ def _remarks(a: Side, b: Side) -> list[str]:
             f"ticks are matched by time: {a.tick_hz:g} Hz against {b.tick_hz:g} Hz,"
             " so only the instants that both have are compared"
         )
-    if a.duration_s != b.duration_s:
+    cut = [side for side in (a, b) if not side.is_complete]
+    for side in cut:
+        remarks.append(
+            f"{side.run.name}: {side.status} before the end of the {side.duration_s:g} s that were planned; what the"
+            " other run has beyond that is alone"
+        )
+    if not cut and a.duration_s != b.duration_s:
         remarks.append(
             f"simulated times differ: {a.duration_s:g} s against {b.duration_s:g} s;"
             " what only the longer run has is alone"

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from cosmos_cli.collect.finished_run import collected_document
 from cosmos_cli.collect.previous_manifest import Earlier, is_there
 from cosmos_cli.diff.recorded import Key, Recorded, recorded_streams
 from cosmos_cli.errors import InputError
@@ -55,6 +55,16 @@ class Side:
         return frozenset(name for one in self.streams.values() for name in (one.stream, one.table))
 
     @property
+    def status(self) -> str:
+        """How the run ended, as run.json tells it."""
+        return str(self.document.get("status"))
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it came to its end: of another run nobody knows how much simulated time it had."""
+        return self.status == "complete"
+
+    @property
     def duration_s(self) -> float:
         """Simulated time that the run was to have, s: a stop shortens it."""
         given = (
@@ -75,11 +85,7 @@ def open_side(run: RunDirectory, given: str) -> Side:
     Raises:
         InputError: It is not collected yet, or what it ran is not known any more.
     """
-    document = run.read_json(run.run_json)
-    if document is None or document.get("status") == "running":
-        raise InputError(
-            f"{run.name} is not collected yet; do that with: cosmos collect {shlex.quote(given)}"
-        )
+    document = collected_document(run, given)
     config = run.read_config()
     # By way of the class, which knows the old names of keys.
     settings = to_mapping(config) if config else (run.read_json(run.plan_json) or {}).get("config")

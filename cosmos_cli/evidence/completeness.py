@@ -21,6 +21,8 @@ LOCKSTEP_STREAMS = (EVENTS.name, LOG.name)
 """Of host and agents where no time is kept: there are no machines' clocks, lateness or health to record."""
 FAULTS_SHOWN_MAX = 3
 HOST = "host"
+LOCKSTEP = "lockstep"
+"""The time mode, in run.json."""
 COUNT_MAX = 2**53
 """Largest count of a file: JSON's readers agree on whole numbers up to here."""
 NOTHING: Mapping[str, str] = MappingProxyType({})
@@ -42,19 +44,43 @@ class ExpectedRecords:
     def of(cls, config: RunConfig, machines: Iterable[str]) -> ExpectedRecords:
         """Return what a run of this configuration on these machines must have recorded."""
         agents = config.agents.resolved_names()
-        if config.time.is_lockstep:
-            streams = LOCKSTEP_STREAMS
-            return cls(agents=agents, agent_streams=streams, host_streams=streams)
-        return cls(agents=agents, machines=tuple(machines))
+        return (
+            cls.in_lockstep(agents)
+            if config.time.is_lockstep
+            else cls(agents=agents, machines=tuple(machines))
+        )
+
+    @classmethod
+    def in_lockstep(cls, agents: tuple[str, ...] = ()) -> ExpectedRecords:
+        """Return what a run in lockstep must have recorded."""
+        return cls(agents=agents, agent_streams=LOCKSTEP_STREAMS, host_streams=LOCKSTEP_STREAMS)
 
     @classmethod
     def read(cls, run: RunDirectory) -> ExpectedRecords:
-        """Return what plan.json promises; of an unreadable plan nothing but the host's own records."""
+        """
+        Return what plan.json promises; of an unreadable plan nothing but the host's own records.
+
+        What a host and any agents must have recorded depends on the time mode, which run.json tells as well.
+        """
         config, plan = run.read_config(), run.read_json(run.plan_json) or {}
         machines = plan.get("machines")
         named = machines if isinstance(machines, Mapping) else {}
         names = tuple(name for name, machine in named.items() if _has_agents(machine))
-        return cls.of(config, names) if config else cls(machines=names)
+        if config:
+            return cls.of(config, names)
+        lockstep = is_in_lockstep(None, run.read_json(run.run_json) or {})
+        return cls.in_lockstep() if lockstep else cls(machines=names)
+
+
+def is_in_lockstep(config: RunConfig | None, document: Mapping[str, Any]) -> bool:
+    """
+    Tell whether simulated time waited for everybody.
+
+    Args:
+        config: The run's; None if its plan is lost.
+        document: Its run.json, as an earlier collection left it.
+    """
+    return config.time.is_lockstep if config else document.get("time_mode") == LOCKSTEP
 
 
 def find_missing(

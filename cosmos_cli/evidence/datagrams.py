@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from cosmos_cli.evidence.completeness import COUNT_MAX, mapping_at
+from cosmos_cli.evidence.completeness import COUNT_MAX, NOTHING, mapping_at
 
 SERVICES = ("best", "reliable", "sync")
 OWN_NAMES = ("lost", "duplicated", "out_of_order")
@@ -37,7 +37,9 @@ USUAL_MAX: Final = 1000
 """The same of the usual reasons."""
 
 
-def packet_counts(agents: Mapping[str, Any]) -> dict[str, dict[str, int | None]]:
+def packet_counts(
+    agents: Mapping[str, Any], faults: Mapping[str, Any] = NOTHING
+) -> dict[str, dict[str, int | None]]:
     """
     Return lost, duplicated and out_of_order by agent; empty where the simulation counts no packets.
 
@@ -46,9 +48,10 @@ def packet_counts(agents: Mapping[str, Any]) -> dict[str, dict[str, int | None]]
 
     Args:
         agents: The host's result by agent: "messages" of its link, "simulation" as it summed up.
+        faults: Its account of the messages that inserted faults were shown, by agent.
 
-    An agent that died summed nothing up: of it the link's counters are told alone, None if it has none. A packet that came
-    behind a newer one counts as out of order, and as lost too, for it never reached the simulation.
+    An agent that died summed nothing up, and one that came back its last life alone: of them what the link lost and what a
+    fault took is told, None if the link counted nothing. A packet that came behind a newer one counts as out of order, and as lost too, for it never reached the simulation.
     """
     own = {name: mapping_at(agents, name, "simulation") for name in agents}
     used = {
@@ -60,7 +63,14 @@ def packet_counts(agents: Mapping[str, Any]) -> dict[str, dict[str, int | None]]
         return {}
     services = tuple(name for name in SERVICES if name in used) or SERVICES
     return {
-        name: _packets_of(mapping_at(agents, name, "messages"), own[name], services) for name in own
+        name: _packets_of(
+            mapping_at(agents, name, "messages"),
+            own[name],
+            services,
+            has_returned=whole_count(mapping_at(agents, name).get("incarnations")) > 1,
+            taken=whole_count(mapping_at(faults, name).get("lost")),
+        )
+        for name in own
     }
 
 
@@ -75,12 +85,17 @@ def duplicates_by_service(agents: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _packets_of(
-    messages: Mapping[str, Any], own: Mapping[str, Any], services: tuple[str, ...]
+    messages: Mapping[str, Any],
+    own: Mapping[str, Any],
+    services: tuple[str, ...],
+    *,
+    has_returned: bool,
+    taken: int,
 ) -> dict[str, int | None]:
     of_link = [mapping_at(messages, service).get("lost") for service in services]
-    link_lost = None if None in of_link else sum(map(whole_count, of_link))
+    link_lost = None if None in of_link else sum(map(whole_count, of_link)) + taken
     return {
-        "lost": whole_count(own["lost"]) if "lost" in own else link_lost,
+        "lost": whole_count(own["lost"]) if "lost" in own and not has_returned else link_lost,
         "duplicated": whole_count(own.get("duplicated")) + _sum(messages, services, "duplicates"),
         "out_of_order": whole_count(own.get("out_of_order")) + _sum(messages, services, "late"),
     }

@@ -9,7 +9,7 @@ from typing import Any
 
 import orjson
 
-from cosmos_cli.evidence.completeness import COUNT_MAX, ExpectedRecords, is_excused, mapping_at
+from cosmos_cli.evidence.completeness import COUNT_MAX, ExpectedRecords, is_excused, is_in_lockstep
 from cosmos_cli.evidence.datagrams import (
     SERVICES,
     datagram_account,
@@ -27,12 +27,7 @@ from cosmos_cli.evidence.run_directory import SCHEMA
 from cosmos_cli.evidence.run_documents import Problem, text_or_none
 from cosmos_cli.evidence.statistics import TickStatistics, TickTotals, tick_totals, worst_sources
 from cosmos_cli.evidence.streams import StreamScan
-from cosmos_cli.evidence.tick_causes import (
-    AgentCauses,
-    CauseTotals,
-    cause_totals,
-    told_causes,
-)
+from cosmos_cli.evidence.tick_causes import AgentCauses, CauseTotals, cause_totals, told_causes
 from cosmos_cli.evidence.verdict import (
     CheckLimits,
     CheckResult,
@@ -44,6 +39,7 @@ from cosmos_cli.evidence.verdict import (
 )
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from madns_runtime.config import HardwareSettings, RunConfig
+from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.newest_values import clean_values
 from madns_runtime.timing.rate import count_ticks
 
@@ -246,7 +242,7 @@ class Evidence:
         return min(float(told), planned_s) if is_number(told) and told >= 0 else planned_s
 
     def _is_lockstep(self) -> bool:
-        return self.config is not None and self.config.time.is_lockstep
+        return is_in_lockstep(self.config, self.started)
 
     def _records_sha256(self) -> str | None:
         """Return what two lockstep runs of one seed have in common: a hash over all that was recorded."""
@@ -289,7 +285,9 @@ class Evidence:
             "timing": self._timing(totals, causes),
             "messages": self._messages(),
             "between_agents": dict(mapping_at(result, "between_agents")),
-            "packets": packet_counts(mapping_at(self.result, "agents")),
+            "packets": packet_counts(
+                mapping_at(self.result, "agents"), mapping_at(self.result, "faults", "agents")
+            ),
             "datagrams": datagram_account(result),
             "faults": dict(mapping_at(result, "faults")),
             "host_calls": dict(mapping_at(result, "host_calls")),

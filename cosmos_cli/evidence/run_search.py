@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import (
+    BUNDLE_SUFFIX,
     FOLDERS,
     RUN_NAME,
     RUNS_FOLDER,
@@ -49,12 +51,17 @@ def find_run(root: Path, which: str, *, is_read: bool = True) -> RunDirectory:
 
 def _find(root: Path, which: str) -> RunDirectory:
     if os.sep in which or which in (".", ".."):
+        if which.endswith(BUNDLE_SUFFIX) and os.path.isfile(which):
+            raise InputError(
+                f"{which}: a packed run; unpack it with: tar -xf {shlex.quote(which)}, then name its folder"
+            )
         if not os.path.isdir(which):
             raise InputError(f"{which}: no such run directory")
         if not _holds_run(Path(which)):
             raise InputError(f"{which}: no run directory: {EXPECTED}")
         return RunDirectory(Path(which).resolve())
-    runs = [run for run in list_runs(root) if _holds_run(run.path)]
+    listed = list_runs(root)
+    runs = [run for run in listed if _holds_run(run.path)]
     found = runs[-1:] if which == "last" else [run for run in runs if _is_meant(run, which)]
     if len(found) == 1:
         return found[0]
@@ -73,6 +80,7 @@ def _find(root: Path, which: str) -> RunDirectory:
             raise InputError(
                 f"{which}: not in {root}, and several elsewhere; give the path: {', '.join(map(shlex.quote, paths))}"
             )
+    _refuse_packed(listed, which)
     _refuse_other(root, which)
     known = ", ".join(run.name for run in runs[-5:]) or "none yet"
     here = ""
@@ -99,6 +107,27 @@ def _holds_run(path: Path) -> bool:
     """Tell whether a folder is a run's; one that lost its plan or a folder is one still."""
     is_planned = os.path.isfile(path / "plan.json")
     return is_planned or all(os.path.isdir(path / folder) for folder in FOLDERS)
+
+
+def _refuse_packed(listed: Sequence[RunDirectory], which: str) -> None:
+    """
+    See that the run that was named is not one of which only the package is left.
+
+    Args:
+        listed: All runs of the folder, by number.
+        which: The run that is not among those that have a folder.
+
+    Raises:
+        InputError: It is; the message says how it is unpacked.
+    """
+    packed = [run for run in listed if run.bundle.is_file() and not os.path.lexists(run.path)]
+    name = which.removesuffix(BUNDLE_SUFFIX)
+    meant = packed[-1:] if which == "last" else [run for run in packed if _is_meant(run, name)]
+    for run in meant:
+        bundle, root = shlex.quote(str(run.bundle)), shlex.quote(str(run.path.parent))
+        raise InputError(
+            f"{run.name}: packed, its folder is gone; unpack it with: tar -xf {bundle} -C {root}"
+        )
 
 
 def _refuse_other(root: Path, which: str) -> None:

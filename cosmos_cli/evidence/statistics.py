@@ -21,6 +21,8 @@ from madns_runtime.analysis.distribution import Distribution, Summary, rounded
 from madns_runtime.analysis.tables import RecordedTable, Tables
 
 US_PER_MS = 1000.0
+LOST = "lost"
+"""State of an agent that did not come to the run's end, as the host tells it."""
 ROUND_TRIP = "round_trip_us"
 CLOCK_ROUND_TRIP = "round_trip_us_min"
 CLOCK_ROUND_TRIP_STREAM = "clock (minimum a window)"
@@ -227,9 +229,13 @@ def worst_sources(
         "records.not_finite": _largest((scan.file.label, scan.not_finite) for scan in scans),
     }
     counts = {name: mapping_at(agents, name, "messages") for name in agents}
+    # What was on its way to and from agents that are lost is in no sum of lost messages.
+    stayed = {
+        name: of for name, of in counts.items() if mapping_at(agents, name).get("state") != LOST
+    }
     for service in SERVICES:
-        for what in ("lost", "deadlines_broken"):
-            told = ((name, mapping_at(of, service).get(what)) for name, of in counts.items())
+        for what, among in (("lost", stayed), ("deadlines_broken", counts)):
+            told = ((name, mapping_at(of, service).get(what)) for name, of in among.items())
             found[f"messages.{service}.{what}"] = _largest(told)
     return {name: who for name, who in found.items() if who is not None}
 

@@ -38,7 +38,8 @@ class CheckResult:
     got: float | None
     passed: bool
     worst: str | None = None
-    """Source of this value, where it is one of many: an agent, the host, a stream."""
+    """Whose value is the worst, where there are many: an agent, the host, a stream. Of the framework's checks `got` is of
+    all of them together, of others it is this one's."""
     agent: str | None = None
     """Of an expectation: the agent of this value, or host."""
     t_s: float | None = None
@@ -343,15 +344,17 @@ def _told(check: CheckResult) -> str:
     got = "not measured" if check.got is None else f"{check.got:g}"
     if got == f"{check.limit:g}" and check.got != check.limit:  # broken by its later digits
         got = f"{check.got}"
-    whose = f" of {first_line(check.worst)}" if check.worst else ""
     if check.expected:
+        whose = f" of {first_line(check.worst)}" if check.worst else ""
         unit = f" {check.unit}" if check.unit and check.got is not None else ""
         when = "" if check.t_s is None else f" at {check.t_s:.10g} s"
         more = f" and {check.agents_broken - 1} more" if check.agents_broken > 1 else ""
         return (
             f"{check.name} {got}{unit}{whose}{more}{when} (expected {first_line(check.expected)})"
         )
-    return f"{check.name} {got}{whose} (limit {check.limit:g})"
+    # A sum or ratio over all is nobody's own: whose share of it is the largest stands apart.
+    worst = f", worst: {first_line(check.worst)}" if check.worst else ""
+    return f"{check.name} {got} (limit {check.limit:g}{worst})"
 
 
 def _listed(items: Sequence[str], shown_max: int = 3) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.datagrams import WORDS
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.run_documents import fault_of_plan
 from cosmos_cli.evidence.run_log import cut_text
 from cosmos_cli.evidence.simulation_calls import call_simulation, check_blocks, json_document
 from cosmos_cli.evidence.table_labels import run_labels
@@ -65,7 +66,7 @@ def build_sections(run: RunDirectory, document: Mapping[str, Any]) -> list[Secti
         document: run.json.
     """
     recorded = open_recorded_run(run, document)
-    own = _simulation_sections(recorded)
+    own = _simulation_sections(run, recorded)
     drawn = {name for section in own for name in section.tables}
     before = chapters.build_sections(TIME_CHAPTERS, recorded)
     after = chapters.build_sections(MACHINE_CHAPTERS, recorded)
@@ -114,11 +115,14 @@ def with_simulation(
     return {**told, **document}
 
 
-def _simulation_sections(recorded: RecordedRun) -> list[Section]:
+def _simulation_sections(run: RunDirectory, recorded: RecordedRun) -> list[Section]:
     """Return the sections that a run's simulation makes of it; a remark if it could not."""
     config = recorded.config
     if config is None:
-        return []
+        fault = fault_of_plan(run.plan_json) or "cannot be used"
+        return _no_figures(
+            f"{run.plan_json}: {fault}; which simulation it was stands there, and its own figures are not drawn"
+        )
     try:
         _, found = call_simulation(config, "figures", recorded)
         if found is None:
@@ -128,15 +132,12 @@ def _simulation_sections(recorded: RecordedRun) -> list[Section]:
         for section in found:
             check_blocks(section.blocks, f"figures(), in section {section.title!r:.80},")
     except PluginError as error:
-        return [
-            Section(
-                title="Figures of the simulation",
-                blocks=[
-                    ReportRemark(text=f"{config.simulation} drew no figures of its own: {error}")
-                ],
-            )
-        ]
+        return _no_figures(f"{config.simulation} drew no figures of its own: {error}")
     return found
+
+
+def _no_figures(why: str) -> list[Section]:
+    return [Section(title="Figures of the simulation", blocks=[ReportRemark(text=why)])]
 
 
 def _gaps(run: RunDirectory, recorded: RecordedRun) -> list[Section]:
@@ -166,8 +167,10 @@ def _load_sections(document: Mapping[str, Any]) -> list[Section]:
 
 
 def _datagram_tables(account: Mapping[str, Any]) -> Iterator[TableBlock]:
-    processes = {"host": mapping_at(account, "host"), **mapping_at(account, "agents")}
-    refusing = {name: entry for name, entry in processes.items() if entry and entry.get("refused")}
+    agents = mapping_at(account, "agents")
+    processes = {"host": mapping_at(account, "host")}
+    processes |= {name: mapping_at(agents, name) for name in agents}
+    refusing = {name: entry for name, entry in processes.items() if entry.get("refused")}
     if not refusing:
         return
     seen = {reason for entry in refusing.values() for reason in mapping_at(entry, "by_reason")}

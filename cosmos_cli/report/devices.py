@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cosmos_cli.evidence.completeness import mapping_at
+from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.report.device_temperature import temperature_blocks
 from madns_runtime.analysis.tables import RecordedRun
 from madns_runtime.analysis.values import Heading, Section, TableBlock
@@ -52,4 +53,6 @@ def device_sections(document: Mapping[str, Any], run: RecordedRun) -> list[Secti
 
 def _counts(devices: Mapping[str, Any], name: str) -> str:
     counts = mapping_at(devices, name, "counts")
-    return ", ".join(f"{key} {value:g}" for key, value in counts.items() if value)
+    return ", ".join(
+        f"{key} {value:g}" for key, value in counts.items() if is_number(value) and value
+    )

@@ -34,6 +34,8 @@ def print_report(
         console.data(line)
     for line in mapping_at(document, "data").get("missing", ()):
         console.data(f"missing: {line}")
+    for problem in document.get("problems", ()):
+        console.data(f"problem: {problem.get('text')}")
     for section in sections:
         _print_section(console, section)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from cosmos_cli.collect.finished_run import collected_document
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.devices import expected_devices
 from cosmos_cli.evidence.run_directory import RunDirectory
@@ -89,7 +89,7 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None = 
     Raises:
         InputError: It cannot be flown again; the text says why, and what to do.
     """
-    check_collected(run, given)
+    collected_document(run, given)
     config = run.read_config()
     if config is None:
         raise InputError(
@@ -120,20 +120,6 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None = 
     status = (run.read_json(run.run_json) or {}).get("status")
     is_cut_off = not config.time.is_lockstep and status != "complete"
     return FlownRun(run=run, config=config, agents=agents, devices=devices, is_cut_off=is_cut_off)
-
-
-def check_collected(run: RunDirectory, given: str) -> None:
-    """
-    See that a run is over and collected.
-
-    Raises:
-        InputError: It is not.
-    """
-    document = run.read_json(run.run_json)
-    if document is None or document.get("status") == "running":
-        raise InputError(
-            f"{run.name} is not collected yet; do that with: cosmos collect {shlex.quote(given)}"
-        )
 
 
 def scenario_folder(run: RunDirectory) -> Path | None:

@@ -185,6 +185,20 @@ def test_folder_without_a_suite_and_a_faulty_file_are_bad_input(tmp_path, capsys
     assert "trials set that themselves" in capsys.readouterr().err
 
 
+def test_capacity_is_not_sought_in_lockstep_where_no_tick_is_ever_missed(tmp_path, capsys):
+    file = tmp_path / "waits.yaml"
+    file.write_text(
+        "{name: waits, simulation: counter, agents: {count: 1, tick_hz: 20},"
+        " time: {mode: lockstep, duration_s: 1}}"
+    )
+
+    for words in ([str(file)], ["--set", "time.mode=lockstep"]):
+        assert cosmos(["bench", "capacity", *words, "--largest", "8", "--seconds", "1"]) == 2
+        told = capsys.readouterr()
+        assert "in lockstep no tick is ever missed" in told.err
+        assert "--set time.mode=realtime" in told.err
+
+
 def test_capacity_tries_runs_and_sets_the_plan_beside(command):
     done = command(
         *("bench", "capacity", "--hz", "20", "--max-miss-ratio", "1", "--seconds", "1"),

@@ -1,3 +1,4 @@
+import dataclasses
 import errno
 import os
 import shutil
@@ -561,6 +562,31 @@ def test_agent_and_plan_that_were_deleted_are_both_named(tmp_path):
     assert summary.exit_code == 5
     named = {line.split(":")[0] for line in summary.missing}
     assert {"agent-02", "plan.json", "agents/agent-02/ticks.jsonl"} <= named
+
+
+def test_run_in_lockstep_whose_plan_is_lost_misses_no_records_of_real_time(tmp_path):
+    config = make_config()
+    in_lockstep = dataclasses.replace(config.time, mode="lockstep")
+    made = SyntheticRun(tmp_path, dataclasses.replace(config, time=in_lockstep)).write()
+    for name in ("ticks", "clock", "process"):
+        for agent in made.names:
+            made.stream(agent, name).unlink()
+            del made.records[agent]["streams"][name]
+    shutil.rmtree(made.run.path / "machines")
+    (made.run.path / "host/health.jsonl").unlink()
+    before = finish(made)
+    assert before.missing == ()
+    made.run.plan_json.unlink()
+
+    after = again(made)
+
+    told = ("missing; it was there when the run was collected",)
+    assert tuple(line for line in after.missing if not line.startswith("tables/")) == tuple(
+        f"plan.json: {text}" for text in told
+    )
+    names = [check["name"] for check in after.document["checks"]]
+    assert names == [check["name"] for check in before.document["checks"]]
+    assert after.document["records_sha256"] == before.document["records_sha256"]
 
 
 def test_agent_and_plan_are_named_even_without_the_manifest(tmp_path):

@@ -1,6 +1,6 @@
 """What `cosmos collect` says of a run that lives: short, however much of it lives."""
 
-from cosmos_cli.collect.finish import still_running
+from cosmos_cli.collect.finished_run import still_running
 from cosmos_cli.errors import ExitCode
 
 HOW = "; wait for its end, or end it with: cosmos down 0007-x"

@@ -1,11 +1,14 @@
 import json
 import os
+import shutil
 
 import pytest
 from harness.synthetic_run import SyntheticRun
 
 from cosmos_cli import app
 from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.evidence.run_documents import Problem
+from madns_runtime.processes import ProcessEntry
 
 
 @pytest.fixture(autouse=True)
@@ -154,6 +157,31 @@ def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
 
 
 @pytest.mark.parametrize("verb", ["report", "judge", "tabulate", "rerun", "diff"])
+def test_run_that_lives_is_to_be_waited_for_as_collecting_it_would_be_refused_too(
+    made, capsys, monkeypatch, verb
+):
+    living = ProcessEntry(
+        run=made.run.name,
+        role="agent",
+        name="agent-02",
+        pid=4242,
+        start_ticks=1,
+        boot_id="x",
+        node="n",
+        run_directory=str(made.run.path),
+        utc="",
+    )
+    monkeypatch.setattr("cosmos_cli.collect.finished_run.list_processes", lambda: [living])
+    monkeypatch.setattr("cosmos_cli.commands.judge.list_processes", lambda: [living])
+
+    assert app.run([verb, "1", *(["1"] if verb == "diff" else [])]) == 2
+
+    told = capsys.readouterr().err
+    assert "is still running: agent agent-02 (pid 4242); wait for its end" in told
+    assert "not collected" not in told
+
+
+@pytest.mark.parametrize("verb", ["report", "judge", "tabulate", "rerun", "diff"])
 def test_commands_to_be_copied_name_a_folder_with_a_space_as_a_shell_takes_it(
     tmp_path, capsys, verb
 ):
@@ -162,6 +190,21 @@ def test_commands_to_be_copied_name_a_folder_with_a_space_as_a_shell_takes_it(
     assert app.run([verb, str(run.path), *([str(run.path)] if verb == "diff" else [])]) == 2
 
     assert f"cosmos collect '{run.path}'" in capsys.readouterr().err
+
+
+def test_report_on_the_terminal_tells_all_that_did_not_go_as_it_should_as_the_page_does(
+    made, capsys
+):
+    made.kill("agent-01")
+    problems = [Problem(text=f"agent-0{n} (pid {n}) had to be killed") for n in range(1, 6)]
+    finish_run(made.run, made.result(), made.expected, problems=problems)
+
+    assert app.run(["report", "1"]) == 0
+
+    told = capsys.readouterr().out.splitlines()
+    assert [f"problem: {problem.text}" for problem in problems] == [
+        line for line in told if line.startswith("problem: ")
+    ]
 
 
 def test_verdict_that_is_not_there_is_said_to_be_none(made, capsys):
@@ -222,6 +265,19 @@ def test_table_is_not_written_under_the_suffix_of_another_format(made, tmp_path,
     assert not (tmp_path / name).exists()
 
 
+def test_table_of_a_run_whose_plan_is_lost_is_refused_for_that_and_not_for_want_of_a_collection(
+    made, capsys
+):
+    finish(made)
+    made.run.plan_json.unlink()
+
+    assert app.run(["tabulate", "1"]) == 2
+
+    told = capsys.readouterr().err
+    assert f"{made.run.plan_json}: missing; put it back as it was" in told
+    assert "cosmos collect" not in told
+
+
 @pytest.mark.slow
 def test_linked_run_is_neither_collected_nor_written_into(made, tmp_path, capsys):
     finish(made)
@@ -236,6 +292,32 @@ def test_linked_run_is_neither_collected_nor_written_into(made, tmp_path, capsys
     assert "0099-evil: a link, which is not followed" in capsys.readouterr().err
     assert [path.name for path in victim.iterdir()] == ["run.json"]
     assert (victim / "run.json").read_text() == "precious"
+
+
+@pytest.mark.parametrize("which", ["1", "0001-synthetic", "0001-synthetic.tar.zst", "last"])
+def test_run_of_which_only_the_package_is_left_is_named_with_the_way_to_unpack_it(
+    made, capsys, which
+):
+    finish(made)
+    shutil.rmtree(made.run.path)
+
+    assert app.run(["report", which]) == 2
+
+    root = made.run.path.parent
+    told = capsys.readouterr().err
+    assert (
+        f"0001-synthetic: packed, its folder is gone; unpack it with: tar -xf {made.run.bundle}"
+        in told
+    )
+    assert f" -C {root}" in told
+
+
+def test_package_that_is_named_by_its_path_is_told_from_a_folder_that_is_not_there(made, capsys):
+    finish(made)
+
+    assert app.run(["diff", "1", str(made.run.bundle)]) == 2
+
+    assert "a packed run; unpack it with: tar -xf " in capsys.readouterr().err
 
 
 def test_unknown_run_is_bad_input(made, capsys):

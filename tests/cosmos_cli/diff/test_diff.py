@@ -148,6 +148,23 @@ def test_missing_agent_is_named(make, capsys):
     assert {"key": "agents.count", "a": 3, "b": 2} in document["settings"]
 
 
+def test_run_that_was_cut_short_is_not_said_to_have_had_the_time_that_was_planned(
+    make, tmp_path, capsys
+):
+    config = make_config(AGENTS, ticks=3 * TICKS)
+    cut = SyntheticRun(tmp_path / "runs", config).write(with_states=True)
+    finish_run(cut.run, cut.result(status="interrupted"), cut.expected, has_report=False)
+    make()
+
+    _, document = diff(capsys, "1", "2")
+
+    assert document["remarks"][0] == (
+        f"{cut.run.name}: interrupted before the end of the 90 s that were planned; what the other run has"
+        " beyond that is alone"
+    )
+    assert not any("simulated times differ" in remark for remark in document["remarks"])
+
+
 def test_different_tick_rates_are_matched_by_time_and_said(make, capsys):
     make(), make(ticks=TICKS // 2, tick_hz=5.0)
 

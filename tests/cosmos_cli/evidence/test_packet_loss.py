@@ -47,6 +47,22 @@ def test_agent_that_summed_nothing_up_has_its_links_counts():
     assert counts["b"] == {"lost": 9, "duplicated": 2, "out_of_order": 3}
 
 
+def test_what_a_fault_took_from_an_agent_that_summed_nothing_up_is_lost_too():
+    own = {"service": "best", "lost": 5, "duplicated": 0, "out_of_order": 0}
+    dead = agent({}, best={"lost": 9}, agent={}, host={})
+
+    counts = packet_counts({"a": agent(own), "b": dead}, {"a": {"lost": 5}, "b": {"lost": 56}})
+
+    assert (counts["a"]["lost"], counts["b"]["lost"]) == (5, 65)
+
+
+def test_agent_that_came_back_has_lost_what_its_earlier_lives_lost_as_well():
+    own = {"service": "best", "lost": 1, "duplicated": 0, "out_of_order": 0}
+    back = agent(own, best={"lost": 2}, agent={}, host={}) | {"incarnations": 2}
+
+    assert packet_counts({"a": back}, {"a": {"lost": 75}})["a"]["lost"] == 77
+
+
 def test_loss_that_nobody_counted_is_not_told_as_none_lost():
     own = {"service": "reliable", "lost": 0, "duplicated": 0, "out_of_order": 0}
     dead = agent({}, reliable={"lost": None}, host={})

@@ -199,14 +199,22 @@ def test_value_that_is_not_finite_was_not_measured_whatever_the_plugin_says(got)
     (check,) = plugin_checks({"agent-07": {"checks": [item]}})
 
     assert check == CheckResult(name="x", limit=1, got=None, passed=False, worst="agent-07")
-    assert "x not measured of agent-07 (limit 1)" in judged(plugin_checks=(check,)).text
+    assert "x not measured (limit 1, worst: agent-07)" in judged(plugin_checks=(check,)).text
+
+
+def test_ratio_over_all_agents_is_not_told_as_that_of_the_worst():
+    verdict = judged(miss_ratio=0.0276, worst={"deadline.miss_ratio": "agent-23"})
+
+    assert verdict.text.startswith(
+        "CHECK BROKEN: deadline.miss_ratio 0.0276 (limit 0.001, worst: agent-23)"
+    )
 
 
 def test_values_that_are_not_finite_break_a_check_of_their_own():
     verdict = judged(records_not_finite=60, worst={"records.not_finite": "agent-02/drive"})
 
     assert (verdict.exit_code, verdict.broken[0].worst) == (4, "agent-02/drive")
-    assert "records.not_finite 60 of agent-02/drive (limit 0)" in verdict.text
+    assert "records.not_finite 60 (limit 0, worst: agent-02/drive)" in verdict.text
     assert judge(
         dataclasses.replace(GOOD, records_not_finite=60), CheckLimits(not_finite_max=60)
     ).text.startswith("PASSED")

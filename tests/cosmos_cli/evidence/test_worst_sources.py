@@ -49,3 +49,11 @@ def test_what_was_lost_on_purpose_is_nobodys_worst():
     agents = {"a": {"ended_on_purpose": [1]}}
 
     assert worst_sources({}, agents, [scan("a", promised=None, dropped=3)]) == {}
+
+
+def test_messages_to_and_from_a_lost_agent_are_nobodys_worst_as_their_sum_leaves_them_out():
+    lost = {"state": "lost", "messages": {"sync": {"lost": 3}}}
+    stopped = {"state": "stopped", "messages": {"sync": {"lost": 1}}}
+
+    assert worst_sources({}, {"a": lost}, []) == {}
+    assert worst_sources({}, {"a": lost, "b": stopped}, []) == {"messages.sync.lost": "b"}

@@ -186,6 +186,20 @@ def test_tables_that_cannot_be_read_are_named_and_the_others_shown(tmp_path):
     assert "Real time" in [section.title for section in others]
 
 
+def test_report_without_the_plan_says_why_the_simulation_tells_nothing(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    document, sections = build(made)
+    assert "Round trips" in sections
+    made.run.plan_json.unlink()
+
+    after = {section.title: section.blocks for section in build_sections(made.run, document)}
+
+    assert "Round trips" not in after
+    assert remarks(after["Figures of the simulation"]) == [
+        f"{made.run.plan_json}: missing; which simulation it was stands there, and its own figures are not drawn"
+    ]
+
+
 def test_machine_without_a_sensor_is_told_plainly(tmp_path):
     _, sections = build(SyntheticRun(tmp_path).write())
 
@@ -291,6 +305,25 @@ def test_failed_run_is_red_and_names_who_why_and_what_is_missing(tmp_path):
     assert " s simulated" not in page
     assert "Data that are missing" in page
     assert "agent-02: " in page
+
+
+@pytest.mark.parametrize(
+    "account",
+    [
+        {"datagrams": {"agents": {"agent-01": 3}}},
+        {"datagrams": {"host": [1], "agents": {"agent-01": {"refused": 2, "by_reason": [1]}}}},
+        {"devices": {"imu": {"counts": {"reads": "many"}}}},
+    ],
+    ids=str,
+)
+def test_account_of_a_run_json_that_was_changed_costs_no_report(tmp_path, account):
+    made = SyntheticRun(tmp_path).write()
+    document, _ = build(made)
+
+    sections = build_sections(made.run, document | account)
+
+    assert "Real time" in [section.title for section in sections]
+    assert render_page(document | account, sections)
 
 
 def test_run_that_recorded_nothing_still_has_a_report(tmp_path):

@@ -1,0 +1,29 @@
+"""The tables of a suite count one thing by one word."""
+
+from pathlib import Path
+
+from cosmos_cli.bench.child_run import ChildRunOutcome
+from cosmos_cli.bench.suite import ROUND_TRIPS, SUMMARY, SuiteRun
+from cosmos_cli.models.loading import load_scenario
+
+SCENARIO = Path(__file__).parents[3] / "scenarios" / "thesis" / "benchmark_at_once.yaml"
+
+
+def test_ticks_are_those_that_were_done_in_the_table_of_a_run_and_in_that_of_all():
+    trips = [{"seen_by": "agent", "agent": name, "count": 398} for name in ("agent-01", "all")]
+    counts = {"agent-01": {"sent": 398, "lost": 0, "ticks": 398, "missed": 9}}
+    document = {
+        "run": "0001-x",
+        "status": "complete",
+        "timing": {"ticks": 407, "missed": 9},
+        "benchmark": {"round_trips_ms": trips, "agents": counts},
+    }
+    outcome = ChildRunOutcome(exit_code=0, document=document)
+    made = SuiteRun(scenario=load_scenario(SCENARIO), outcome=outcome, document=document)
+
+    def told(columns, row):
+        cells = dict(zip((column.heading for column in columns), row, strict=True))
+        return cells["ticks"], cells["missed"]
+
+    assert [told(ROUND_TRIPS, row) for row in made.rows()] == [("398", "9")] * 2
+    assert [told(SUMMARY, row) for row in made.summary_rows()] == [("398", "9")]
