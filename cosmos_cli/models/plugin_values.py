@@ -10,6 +10,7 @@ from typing import Any
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.document import dotted
 from cosmos_cli.models.yaml_source import WHOLE_MAX, WHOLE_MIN
+from madns_runtime.plain_values import shown
 
 
 def not_sendable(value: Any, path: ValuePath) -> Iterator[str]:
@@ -20,7 +21,11 @@ def not_sendable(value: Any, path: ValuePath) -> Iterator[str]:
     """
     if isinstance(value, Mapping):
         for key, item in value.items():
-            yield from not_sendable(item, (*path, str(key)))
+            if not isinstance(key, str):
+                yield f"{dotted(path)}: expected texts as keys, got {shown(key)}"
+                continue
+            yield from not_sendable(key, path)
+            yield from not_sendable(item, (*path, key))
     elif isinstance(value, list | tuple):
         for index, item in enumerate(value):
             yield from not_sendable(item, (*path, index))
@@ -34,6 +39,11 @@ def not_sendable(value: Any, path: ValuePath) -> Iterator[str]:
         and value != value.encode("utf-8", "replace").decode("utf-8")
     ):
         yield f"{dotted(path)}: expected text that UTF-8 can hold, got {value!r:.60}"
+    elif not isinstance(value, str | float | int | None):  # what a field of type Any may have
+        yield (
+            f"{dotted(path)}: expected None, true or false, a number, a text, a list or a mapping, got"
+            f" {shown(value)}; turn it into one of these"
+        )
 
 
 def is_same(made: Any, found: Any) -> bool:

@@ -268,7 +268,7 @@ def test_a_wrong_value_is_told_at_its_place(folder, key, value, told):
 
 ODD = """
 import datetime, decimal, enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Callable, NamedTuple
 from madns_runtime.plugin.api import AgentSimulation, Simulation
 
@@ -374,6 +374,32 @@ def test_default_that_no_message_can_hold_is_refused(tmp_path, kind, default, to
     (tmp_path / "odd.py").write_text(
         ODD.replace("KIND", "int").replace(
             "    inner: Inner | None = None\n", f"    height: {kind} = {default}\n"
+        )
+    )
+    (tmp_path / "a.yaml").write_text("name: a\nsimulation: ./odd.py:simulation\nagents: {count: 1}")
+    with pytest.raises(InputError, match=told) as caught:
+        load_scenario(tmp_path / "a.yaml")
+
+    assert f"{tmp_path}/odd.py:" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("default", "told"),
+    [
+        ("object()", "height: expected None, true or false, a number, a text, a list or a mapping"),
+        ("b'abc'", r"got b'abc'; turn it into one of these"),
+        ("complex(1)", "a list or a mapping, got"),
+        ("frozenset((1, 2))", "a list or a mapping, got frozenset"),
+        ("(1, object())", r"height\[1\]: expected None, true or false"),
+        ("__import__('numpy').int64(3)", r"got np.int64\(3\)"),
+        ("field(default_factory=lambda: __import__('numpy').zeros(2))", r"got array\("),
+        ("field(default_factory=lambda: {1: 2})", "height: expected texts as keys, got 1"),
+    ],
+)
+def test_a_default_of_any_kind_that_is_no_value_of_yaml_is_refused(tmp_path, default, told):
+    (tmp_path / "odd.py").write_text(
+        ODD.replace("KIND", "int").replace(
+            "    inner: Inner | None = None\n", f"    height: Any = {default}\n"
         )
     )
     (tmp_path / "a.yaml").write_text("name: a\nsimulation: ./odd.py:simulation\nagents: {count: 1}")
