@@ -47,8 +47,14 @@ def not_sendable(value: Any, path: ValuePath) -> Iterator[str]:
 
 
 def is_same(made: Any, found: Any) -> bool:
-    """Compare plain values; NaN is the same as NaN."""
-    return json.dumps(made, sort_keys=True) == json.dumps(found, sort_keys=True)
+    """Compare plain values, those that were made anew with those before; a float of a whole number has its value."""
+    if isinstance(made, Mapping) and isinstance(found, Mapping):
+        return made.keys() == found.keys() and all(is_same(made[key], found[key]) for key in made)
+    if isinstance(made, list) and isinstance(found, list):
+        return len(made) == len(found) and all(map(is_same, made, found))
+    if isinstance(made, float) and type(found) is int:  # a default such as 5 of a field of floats
+        return made == found
+    return json.dumps(made) == json.dumps(found)
 
 
 def changed(made: Mapping[str, Any], found: Mapping[str, Any]) -> str:

@@ -407,3 +407,26 @@ def test_a_default_of_any_kind_that_is_no_value_of_yaml_is_refused(tmp_path, def
         load_scenario(tmp_path / "a.yaml")
 
     assert f"{tmp_path}/odd.py:" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "default"),
+    [
+        ("float", "5"),
+        ("Annotated[float, Ge(0)]", "0"),
+        ("tuple[float, ...]", "(5, 1.5)"),
+        ("tuple[tuple[float, float], ...]", "((0, 1), (2, 3))"),
+        ("float | None", "5"),
+    ],
+)
+def test_a_whole_number_does_as_the_default_of_a_float(tmp_path, kind, default):
+    code = PLUGIN.split("class Sail")[0].rsplit("@dataclass", 1)[0] + (
+        "@dataclass(frozen=True, kw_only=True)\n"
+        f"class Parameters:\n    height_m: {kind} = {default}\n\n"
+        "class Boat(AgentSimulation):\n    pass\n\n"
+        'simulation = Simulation(name="boat", parameters=Parameters, agent=":Boat")\n'
+    )
+    (tmp_path / "odd.py").write_text(code)
+    (tmp_path / "a.yaml").write_text("name: a\nsimulation: ./odd.py:simulation\nagents: {count: 1}")
+
+    load_scenario(tmp_path / "a.yaml")
