@@ -28,6 +28,7 @@ from cosmos_cli.evidence.tables import TableLayout, TableWriter
 from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
 from cosmos_cli.ui.plural import counted
 from madns_runtime import errors as runtime_errors
+from madns_runtime.analysis.field_checks import real_array
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
 from madns_runtime.partial_file import check_replaceable, remove_partial
@@ -292,10 +293,8 @@ def _as_floats(part: Any) -> Tabulated:
     """Return rows with every column as floats, as their simulation should give them."""
     rows: Tabulated = replace(
         part,
-        times_s=np.asarray(part.times_s, dtype=np.float64),
-        columns={
-            name: np.asarray(column, dtype=np.float64) for name, column in part.columns.items()
-        },
+        times_s=real_array(part.times_s, "times_s"),
+        columns={name: real_array(column, name) for name, column in part.columns.items()},
     )
     return rows
 

@@ -80,6 +80,7 @@ def rows(folder, change="{}", agents=AGENTS):
         ("{'fields': (Field('x_m', 'm', 'odd'),)}", "expected fields of kind"),
         ("{'columns': {'x_m': np.zeros((3, 2))}}", "must yield a value a time of each of x_m"),
         ("{'columns': {'x_m': np.array(['a'] * 3, object)}}", "could not convert string to float"),
+        ("{'columns': {'x_m': times_s * 1j}}", "x_m: expected real numbers, got complex128"),
     ],
 )
 def test_what_is_no_row_of_an_agent_is_told_with_its_place(tmp_path, change, told):
