@@ -253,6 +253,14 @@ def test_the_value_of_a_job_is_handed_in(logged):
     assert half.simulation.got == (4, "truth")
 
 
+def test_a_job_that_somebodys_executor_cancels_is_told(logged):
+    future: Future[Any] = Future()
+    future.cancel()
+
+    with pytest.raises(HalfFailed, match=r"^Base: job 4: the executor has cancelled it$"):
+        made(Base, logged, HostHalf).take_job(4, future)
+
+
 @pytest.mark.parametrize(
     ("error", "told"),
     [
