@@ -37,10 +37,9 @@ def create_partial(path: Path, *, mode: int = 0o666, takes_over: bool = False) -
     Raises:
         OSError: The folder takes no file.
     """
-    plain = path.with_name(f".{path.name}{SUFFIX}")
+    plain = _plain_name(path)
     if takes_over:
-        with contextlib.suppress(OSError):  # another user's, say: then it stays and is not used
-            plain.unlink()
+        remove_partial(path)
         with contextlib.suppress(FileExistsError):
             return plain, os.open(plain, FLAGS, mode)
     for _ in range(TRIES_MAX - 1):
@@ -49,6 +48,12 @@ def create_partial(path: Path, *, mode: int = 0o666, takes_over: bool = False) -
             return partial, os.open(partial, FLAGS, mode)
     partial = _random_name(path)
     return partial, os.open(partial, FLAGS, mode)
+
+
+def remove_partial(path: Path) -> None:
+    """Remove what a killed writer of *path* left; another user's, say, stays, and is not used."""
+    with contextlib.suppress(OSError):
+        _plain_name(path).unlink()
 
 
 def check_replaceable(path: Path) -> None:
@@ -125,6 +130,10 @@ def sync_folder(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _plain_name(path: Path) -> Path:
+    return path.with_name(f".{path.name}{SUFFIX}")
 
 
 def _random_name(path: Path) -> Path:

@@ -1,7 +1,9 @@
 """
 A table of what the host recorded in a form of its own, made through the simulation's descriptor.
 
-The simulation says how its records are read; here rows become a Parquet file like a run's other tables.
+The simulation says how its records are read; here rows become a Parquet file like a run's other tables. Code of a
+simulation that is not shipped runs, and its rows are written, in a process of its own with a deadline: it may hang, print
+or end the process.
 """
 
 from __future__ import annotations
@@ -23,16 +25,19 @@ from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import RecordFile
 from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.evidence.tables import TableLayout, TableWriter
+from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
 from cosmos_cli.ui.plural import counted
+from madns_runtime import errors as runtime_errors
+from madns_runtime.analysis.field_checks import real_array
 from madns_runtime.config import RunConfig
-from madns_runtime.errors import PluginError
-from madns_runtime.partial_file import check_replaceable
+from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
+from madns_runtime.partial_file import check_replaceable, remove_partial
 from madns_runtime.plain_values import shown
 from madns_runtime.plugin.api import Tabulated
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.descriptor_faults import COLUMNS_OF_TABLES
 from madns_runtime.plugin.isolation import call_plugin
-from madns_runtime.plugin.registry import load_function, resolve
+from madns_runtime.plugin.registry import is_shipped, load_function, resolve
 from madns_runtime.recording.records import Field, StreamSchema
 from madns_runtime.recording.stream_rules import check_schema
 
@@ -44,6 +49,9 @@ ROWS_OF_AGENT_MAX = 20_000_000
 NAMES_MAX = 10
 """Agents that are named in a message."""
 
+TABULATING = "tabulating "
+"""Begin of a stage's name; the agent's follows."""
+
 Times = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 Layout = Callable[[tuple[Field, ...]], TableLayout]
@@ -53,7 +61,6 @@ Layout = Callable[[tuple[Field, ...]], TableLayout]
 class Written:
     """Account of a table that was written."""
 
-    path: Path
     rows: int
     gaps: dict[str, int]
     """Agents of which nothing is on record at some of the times, and at how many."""
@@ -81,6 +88,87 @@ def times_of(config: RunConfig, ran_s: float | None, rate_hz: float) -> Times:
     count = int(last) + 1
     # As a tick's time is made of its number, so that both have the same digits.
     return np.arange(count) / rate_hz
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wanted:
+    """A table that is to be written: of which agents, at which times, where, and how its fields become columns."""
+
+    agents: tuple[str, ...]
+    times_s: Times
+    path: Path
+    layout: Layout
+
+
+def write_host_table(
+    run: RunDirectory, config: RunConfig, wanted: Wanted, progress: Progress
+) -> Written:
+    """
+    Write a table of what the host recorded of agents, in a form of its simulation's own.
+
+    Raises:
+        InputError: The simulation records nothing of the kind, or in a file that is not read; or the table cannot be
+            written.
+        MachineError: The record cannot be read.
+        PluginError: The simulation's `tabulate` does not keep its contract, ended its process or came to no end.
+        MissingExtraError: It needs an optional dependency that is not installed.
+    """
+    if is_shipped(config.simulation):
+        return _write_here(run, config, wanted, progress)
+
+    def work(tell: Callable[[str], None]) -> Mapping[str, Any]:
+        tell(f"importing {config.simulation}")
+        try:
+            written = _write_here(run, config, wanted, lambda _what, _share: None, tell)
+        except MissingExtraError as error:
+            return {"missing": [error.module, error.extra]}
+        except (InputError, MadnsError) as error:
+            return {"raised": [type(error).__name__, str(error)]}
+        return {"written": [written.rows, written.gaps]}
+
+    told: dict[str, None] = {}
+
+    def hear(stage: str) -> None:
+        if stage.startswith(TABULATING) and stage not in told:
+            progress(stage, min(len(told) / len(wanted.agents), 1.0))
+            told[stage] = None
+
+    try:
+        answer = work_separately(work, limit_s=config.timeouts.loading_s, hear=hear)
+    except SeparateFailure as error:
+        raise PluginError(str(error)) from None
+    except SeparateDefect as defect:
+        raise RuntimeError(str(defect)) from None
+    finally:
+        remove_partial(wanted.path)  # of a process that was killed
+    if "missing" in answer:
+        raise MissingExtraError(*answer["missing"])
+    if "raised" in answer:
+        name, text = answer["raised"]
+        raise getattr(runtime_errors, name, InputError)(text)
+    rows, gaps = answer["written"]
+    return Written(rows=rows, gaps=gaps)
+
+
+def _write_here(
+    run: RunDirectory,
+    config: RunConfig,
+    wanted: Wanted,
+    progress: Progress,
+    tell: Callable[[str], None] = lambda stage: None,
+) -> Written:
+    """Write the table in this process; *tell* hears of every part, and of which agent it is."""
+    parts = tabulated(run, config, wanted.agents, wanted.times_s)
+
+    def telling() -> Iterator[Tabulated]:
+        tell(f"tabulate() of {config.simulation}")
+        for part in parts:
+            tell(f"{TABULATING}{part.agent}")
+            yield part
+
+    return write_table(
+        telling(), wanted.layout, wanted.path, agents=len(wanted.agents), progress=progress
+    )
 
 
 def tabulated(
@@ -205,10 +293,8 @@ def _as_floats(part: Any) -> Tabulated:
     """Return rows with every column as floats, as their simulation should give them."""
     rows: Tabulated = replace(
         part,
-        times_s=np.asarray(part.times_s, dtype=np.float64),
-        columns={
-            name: np.asarray(column, dtype=np.float64) for name, column in part.columns.items()
-        },
+        times_s=real_array(part.times_s, "times_s"),
+        columns={name: real_array(column, name) for name, column in part.columns.items()},
     )
     return rows
 
@@ -226,7 +312,7 @@ def _write(
                 writer = TableWriter(path, layout(part.fields))
             if file is None or file.source != part.agent:
                 done += file is not None
-                progress(f"tabulating {part.agent}", min(done / agents, 1.0))
+                progress(f"{TABULATING}{part.agent}", min(done / agents, 1.0))
                 if file is not None:
                     writer.end_file(file)
                 file = _source(part, path)
@@ -242,7 +328,7 @@ def _write(
         if writer is not None:
             writer.abandon()
         raise
-    return Written(path=path, rows=writer.rows, gaps=gaps)
+    return Written(rows=writer.rows, gaps=gaps)
 
 
 def layout_with(labels: TableLabels) -> Layout:

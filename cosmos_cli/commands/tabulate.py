@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.collect.finished_run import collected_document
-from cosmos_cli.collect.host_tables import NAME, layout_with, tabulated, times_of, write_table
+from cosmos_cli.collect.host_tables import NAME, Wanted, layout_with, times_of, write_host_table
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import alone, runs_root
@@ -72,10 +72,8 @@ def tabulate(
     names = _chosen(config.agents.resolved_names(), agents or [], labels.agents)
     path = output or found.path / f"{NAME}.parquet"
     with alone(found, must_own=output is None), told_progress(console, found.name) as progress:
-        parts = tabulated(found, config, names, times_s)
-        written = write_table(
-            parts, layout_with(labels), path, agents=len(names), progress=progress
-        )
+        wanted = Wanted(agents=names, times_s=times_s, path=path, layout=layout_with(labels))
+        written = write_host_table(found, config, wanted, progress)
     for agent, count in list(written.gaps.items())[:AGENTS_NAMED_MAX]:
         console.warn(f"{agent}: nothing is on record at {count} of {len(times_s)} times")
     if len(written.gaps) > AGENTS_NAMED_MAX:

@@ -7,7 +7,7 @@ may have been changed since, raise, hang or end the process.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from madns_runtime.analysis.plain import from_plain, to_plain
 from madns_runtime.analysis.values import Block
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError, PluginError
-from madns_runtime.plugin.isolation import call_plugin
+from madns_runtime.plugin.isolation import call_plugin, unfolded
 from madns_runtime.plugin.registry import is_shipped, load_function, resolve
 from madns_runtime.recording.encoding import to_plain as plain_array
 
@@ -117,10 +117,4 @@ def _call(config: RunConfig, part: Part, arguments: tuple[Any, ...], tell: Tell)
         return simulation.name, None
     function = load_function(where, base_directory)
     tell(f"{part}() of {config.simulation}")
-    return simulation.name, call_plugin(part, function, *arguments, finish=_unfolded)
-
-
-def _unfolded(found: Any) -> Any:
-    """Return a list of what a generator yields: it does its work only then."""
-    is_plain = isinstance(found, str | Mapping) or not isinstance(found, Iterable)
-    return found if is_plain else list(found)
+    return simulation.name, call_plugin(part, function, *arguments, finish=unfolded)

@@ -10,6 +10,7 @@ from typing import Any
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.document import dotted
 from cosmos_cli.models.yaml_source import WHOLE_MAX, WHOLE_MIN
+from madns_runtime.plain_values import shown
 
 
 def not_sendable(value: Any, path: ValuePath) -> Iterator[str]:
@@ -20,7 +21,11 @@ def not_sendable(value: Any, path: ValuePath) -> Iterator[str]:
     """
     if isinstance(value, Mapping):
         for key, item in value.items():
-            yield from not_sendable(item, (*path, str(key)))
+            if not isinstance(key, str):
+                yield f"{dotted(path)}: expected texts as keys, got {shown(key)}"
+                continue
+            yield from not_sendable(key, path)
+            yield from not_sendable(item, (*path, key))
     elif isinstance(value, list | tuple):
         for index, item in enumerate(value):
             yield from not_sendable(item, (*path, index))
@@ -34,11 +39,22 @@ def not_sendable(value: Any, path: ValuePath) -> Iterator[str]:
         and value != value.encode("utf-8", "replace").decode("utf-8")
     ):
         yield f"{dotted(path)}: expected text that UTF-8 can hold, got {value!r:.60}"
+    elif not isinstance(value, str | float | int | None):  # what a field of type Any may have
+        yield (
+            f"{dotted(path)}: expected None, true or false, a number, a text, a list or a mapping, got"
+            f" {shown(value)}; turn it into one of these"
+        )
 
 
 def is_same(made: Any, found: Any) -> bool:
-    """Compare plain values; NaN is the same as NaN."""
-    return json.dumps(made, sort_keys=True) == json.dumps(found, sort_keys=True)
+    """Compare plain values, those that were made anew with those before; a float of a whole number has its value."""
+    if isinstance(made, Mapping) and isinstance(found, Mapping):
+        return made.keys() == found.keys() and all(is_same(made[key], found[key]) for key in made)
+    if isinstance(made, list) and isinstance(found, list):
+        return len(made) == len(found) and all(map(is_same, made, found))
+    if isinstance(made, float) and type(found) is int:  # a default such as 5 of a field of floats
+        return made == found
+    return json.dumps(made) == json.dumps(found)
 
 
 def changed(made: Mapping[str, Any], found: Mapping[str, Any]) -> str:

@@ -54,13 +54,16 @@ class SeparateDefect(Exception):
     """The work raised something that nobody foresaw; the text is its traceback."""
 
 
-def work_separately(work: Work, *, limit_s: float) -> Mapping[str, Any]:
+def work_separately(
+    work: Work, *, limit_s: float, hear: Callable[[str], None] | None = None
+) -> Mapping[str, Any]:
     """
     Do *work* in a forked process and return what it returns.
 
     Args:
         work: What to do. What it prints goes to standard error, cleaned and within bounds; it has no standard input.
         limit_s: For each of its stages; time in which it waits for a processor does not count.
+        hear: Takes the name of each stage as it begins.
 
     Raises:
         SeparateFailure: There is no answer.
@@ -82,7 +85,7 @@ def work_separately(work: Work, *, limit_s: float) -> Mapping[str, Any]:
     os.close(write_fd)
     os.close(said_fd)
     try:
-        return _Listener(pid, read_fd, Overheard(heard_fd), limit_s).answer()
+        return _Listener(pid, read_fd, Overheard(heard_fd), limit_s, hear).answer()
     finally:
         os.close(read_fd)
         os.close(heard_fd)
@@ -91,8 +94,15 @@ def work_separately(work: Work, *, limit_s: float) -> Mapping[str, Any]:
 class _Listener:
     """Bytes that came from the process until now."""
 
-    def __init__(self, pid: int, fd: int, overheard: Overheard, limit_s: float) -> None:
-        self._pid, self._fd, self._limit_s = pid, fd, limit_s
+    def __init__(
+        self,
+        pid: int,
+        fd: int,
+        overheard: Overheard,
+        limit_s: float,
+        hear: Callable[[str], None] | None,
+    ) -> None:
+        self._pid, self._fd, self._limit_s, self._hear = pid, fd, limit_s, hear
         self._overheard = overheard
         self._stage = "it started"
         self._is_reaped = False
@@ -112,6 +122,8 @@ class _Listener:
         for kind, content in self._frames():
             if kind == STAGE:
                 self._stage = content.decode(errors="replace")
+                if self._hear is not None:
+                    self._hear(self._stage)
                 self._restart()
             elif kind == NO_MEMORY:
                 raise MemoryError(self._stage)

@@ -17,9 +17,14 @@ from pydantic import ValidationError
 from cosmos_cli.errors import Fault
 from cosmos_cli.models.document import Document, did_you_mean
 from cosmos_cli.models.parameters import adapter_of
+from cosmos_cli.models.plugin_values import changed, is_same, not_sendable
 from cosmos_cli.models.timeline_rules import ENTRIES_MAX, RULE_KEYS, parameters_in
 from cosmos_cli.models.translate import faults_of
-from madns_runtime.config import to_mapping
+from madns_runtime.config import from_mapping, to_mapping
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.plugin.code_places import place_of
+from madns_runtime.plugin.isolation import is_interruption, said
+from madns_runtime.plugin.time_limit import hold
 from madns_runtime.timeline.action import ActionKind, Lasting, PlannedAction
 from madns_runtime.timeline.kinds import FRAMEWORK_ACTIONS, kinds_by_word
 
@@ -142,12 +147,36 @@ def _validated(document: Document, place: int, given: Mapping[str, Any], kind: A
         for key in unknown
     ]
     rest = {key: value for key, value in given.items() if key in own}
+    made: Any = None
+    texts: list[str] = []
     try:
-        made = adapter_of(kind.parameters).validate_json(json.dumps(rest), strict=True)
+        with hold():
+            made = adapter_of(kind.parameters).validate_json(json.dumps(rest), strict=True)
+            texts = _faults_of_defaults(kind.parameters, to_mapping(made))
     except ValidationError as error:
         errors = error.errors(include_url=False)
         faults += faults_of(document, errors, kind.parameters, below=("timeline", place))
+    except BaseException as error:  # a plug-in's class may raise anything
+        if is_interruption(error):
+            raise
+        texts = [said(error)]
+    if texts:  # the file is read for it
+        where = f"{place_of(kind.parameters)}: {kind.parameters.__name__}"
+        action = ("timeline", place, "action")
+        faults += [document.fault(action, f"{where}: {text}") for text in texts]
     return faults or made
+
+
+def _faults_of_defaults(kind: type, plain: Mapping[str, Any]) -> list[str]:
+    """Say what keeps parameters from being made anew where the action takes place: what the scenario gives was looked at."""
+    if texts := list(not_sendable(plain, ())):
+        return texts
+    try:
+        found = to_mapping(from_mapping(kind, plain, kind.__name__))
+    except ConfigurationError as error:
+        told = str(error).removeprefix(f"{kind.__name__}.")
+        return [f"{told}; a default must be of its field's type"]
+    return [] if is_same(found, plain) else [changed(found, plain)]
 
 
 def _texts(given: Any) -> tuple[str, ...]:

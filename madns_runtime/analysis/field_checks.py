@@ -11,14 +11,31 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from madns_runtime.plain_values import is_whole, shown
+
+NO_REALS = "cMm"
+"""Kinds of arrays that NumPy makes floats of by dropping what they mean: complex numbers, dates, spans of time."""
+
+
+def real_array(values: Any, place: str) -> NDArray[np.float64]:
+    """
+    Return values as an array of floats; *place* is for the message.
+
+    Raises:
+        ValueError: They are no real numbers; or NumPy's own, with a TypeError as well.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind in NO_REALS:
+        raise ValueError(f"{place}: expected real numbers, got {array.dtype}")
+    return array.astype(np.float64, copy=False)
 
 
 def hold_arrays(owner: Any, shapes: Mapping[str, int]) -> None:
     """Turn fields of *owner* into arrays of so many dimensions."""
     for name, dimensions in shapes.items():
-        array = np.asarray(getattr(owner, name), dtype=np.float64)
+        array = real_array(getattr(owner, name), _place(owner, name))
         if array.ndim != dimensions:
             raise ValueError(
                 f"{_place(owner, name)}: expected {dimensions} dimensions, got {array.ndim}"

@@ -19,7 +19,7 @@ from madns_runtime.errors import ConfigurationError, MadnsError
 from madns_runtime.hardware.bounds import bound_faults
 from madns_runtime.hardware.fault_actions import check_fault
 from madns_runtime.hardware.order_socket import LineSocket, Readers
-from madns_runtime.plain_values import from_mapping, to_mapping
+from madns_runtime.plain_values import from_mapping, shown, to_mapping
 from madns_runtime.timeline.action import ActionKind
 from madns_runtime.timeline.kinds import DEVICE_FAULT, DeviceFault
 from madns_runtime.timeline.runner import OrderedAction
@@ -138,7 +138,7 @@ class ActionSocket:
         parameters = order.get("parameters")
         given = dict(parameters) if isinstance(parameters, dict) else {}
         _take_texts(kind, given, order.get("texts"))
-        made: Any = from_mapping(kind.parameters, given, word)
+        made = _made(kind, given)
         if faults := bound_faults(made, word):
             raise ConfigurationError("; ".join(faults))
         agents = self._chosen(kind, target)
@@ -147,7 +147,7 @@ class ActionSocket:
         return OrderedAction(
             word=word,
             agents=agents,
-            parameters=to_mapping(made),
+            parameters=_told(kind, made),
             for_s=_length_s(kind, order.get("for_s")),
         )
 
@@ -185,6 +185,38 @@ def _take_texts(kind: ActionKind, given: dict[str, Any], texts: Any) -> None:
     for name, text in texts.items() if isinstance(texts, dict) else ():
         if wanted.get(name) is str and name in given and isinstance(text, str):
             given[name] = text
+
+
+def _made(kind: ActionKind, given: Mapping[str, Any]) -> Any:
+    """
+    Return an instance of an action's parameters.
+
+    Raises:
+        ConfigurationError: They do not fit, or their class, which may be a plug-in's, refuses them.
+    """
+    try:
+        return from_mapping(kind.parameters, given, kind.word)
+    except MadnsError:
+        raise
+    except Exception as error:  # its own __post_init__ may raise anything
+        raise ConfigurationError(
+            f"{kind.word}: {kind.parameters.__name__} cannot be made: {shown(error)}"
+        ) from error
+
+
+def _told(kind: ActionKind, made: Any) -> dict[str, Any]:
+    """
+    Return an action's parameters as events and agents are told them.
+
+    Raises:
+        ConfigurationError: A default is no value that can be told; in a timeline it is found before the run.
+    """
+    plain = to_mapping(made)
+    try:
+        orjson.dumps(plain)
+    except TypeError as error:
+        raise ConfigurationError(f"{kind.word}: its parameters cannot be told: {error}") from error
+    return plain
 
 
 def _first_of(in_force: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -124,6 +124,47 @@ class AgentOrders:
         return absent
 
 
+class AgentHalfActions(AgentOrders):
+    """
+    Handler of actions that agents' halves carry out.
+
+    Args:
+        kinds: Of the simulation, by word.
+        post: Sends an agent an order; False if it is not there.
+        intended: Where agents are noted that an action loses: those that are ordered it.
+    """
+
+    def __init__(
+        self,
+        kinds: Mapping[str, ActionKind],
+        post: Callable[[str, ActionOrder], bool],
+        intended: IntendedLosses,
+    ) -> None:
+        super().__init__(post)
+        self._kinds = kinds
+        self._intended = intended
+
+    def begin(self, action: TimelineAction) -> list[str]:
+        """
+        Order it, and return who is not there.
+
+        Raises:
+            ActionRefused: None of its agents is there.
+        """
+        absent = super().begin(action)
+        self._note(action, set(action.agents).difference(absent))
+        return absent
+
+    def resume(self, action: TimelineAction, agent: str) -> None:
+        """Order its begin of an agent that has returned."""
+        super().resume(action, agent)
+        self._note(action, {agent})
+
+    def _note(self, action: TimelineAction, agents: set[str]) -> None:
+        if self._kinds[action.word].loses_agents:
+            self._intended.note(agents)
+
+
 class DeviceFaults(AgentOrders):
     """
     Handler of device_fault: a device, and the faults around it, outlive its agent's start.
@@ -208,8 +249,9 @@ def timeline_runner(  # noqa: PLR0913 - the collaborators of a seam, most keywor
         intended: Where agents are noted that an action loses.
     """
     kinds = kinds_by_word(declared)
-    of_host = HostHalfActions({kind.word: kind for kind in declared}, call, intended)
-    of_agents, device_faults = AgentOrders(post), DeviceFaults(post)
+    by_word = {kind.word: kind for kind in declared}
+    of_host = HostHalfActions(by_word, call, intended)
+    of_agents, device_faults = AgentHalfActions(by_word, post, intended), DeviceFaults(post)
     handlers = {
         ANNOTATE.word: Annotations(),
         STOP.word: Stops(stop),

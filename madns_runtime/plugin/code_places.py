@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from madns_runtime.bounded_files import read_regular_file
+from madns_runtime.plugin import time_limit
 
 CODE_BYTES_MAX = 16 * 1024 * 1024
 """Of a file of Python: no text that somebody wrote is longer."""
@@ -87,5 +88,9 @@ def last_place(error: BaseException, module: str) -> str:
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: "
     frames = traceback.extract_tb(error.__traceback__)[1:]  # the first is where it was caught
-    outside = [frame for frame in frames if "importlib" not in frame.filename]
+    outside = [
+        frame
+        for frame in frames
+        if "importlib" not in frame.filename and frame.filename != time_limit.__file__
+    ]
     return f"{outside[-1].filename}:{outside[-1].lineno}: " if outside else f"{module}: "

@@ -170,7 +170,7 @@ class JobRunner:
     Args:
         reactor: The loop in which *on_done* is called.
         executor: Who works.
-        on_done: Called with the job's number and its finished future.
+        on_done: Called with the job's number and its future, which is finished, or was cancelled by the executor.
     """
 
     def __init__(
@@ -237,5 +237,5 @@ class JobRunner:
 
     def _done(self, job: int) -> None:
         future = self._pending.pop(job, None)
-        if future is not None and not future.cancelled():
+        if future is not None:  # after `close` nobody awaits it
             self._on_done(job, future)

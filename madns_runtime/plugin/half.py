@@ -45,8 +45,6 @@ STAND_S: Final = 1e-6
 """Who asks for times that are nearer to each other lets simulated time stand."""
 REPEATS_MAX: Final = 100_000
 """Calls of the timer, or jobs, at one simulated time; more means that the half never lets time go on."""
-
-
 READY_SHARE = 0.8
 """Of timeouts.host_start_s, or timeouts.agents_ready_s, for loading."""
 LEFT_SHARE = 0.1
@@ -386,13 +384,14 @@ class HostHalf(Half):
         Hand in the value of a job that is done.
 
         Raises:
-            HalfFailed: The job or `result` raised.
+            HalfFailed: The job or `result` raised, or the executor has cancelled the job.
         """
-        error = future.exception()
-        if error is None:
+        doing = f"{self.name}: job {job}"
+        if future.cancelled():
+            raise HalfFailed(f"{doing}: the executor has cancelled it")
+        if (error := future.exception()) is None:
             self.call("result", job, future.result())
             return
-        doing = f"{self.name}: job {job}"
         if isinstance(error, BrokenExecutor):
             raise HalfFailed(f"{doing}: {describe_broken(error)}")
         self._log("critical", "".join(traceback.format_exception(error)))

@@ -7,14 +7,17 @@ process (`sys.exit`) where it meant to end itself: that is a fault of the plug-i
 
 from __future__ import annotations
 
+import itertools
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
 from madns_runtime.plugin.code_places import blame, error_text
 from madns_runtime.plugin.time_limit import PluginStopped, hold
 
+ITEMS_MAX = 1_000_000
+"""Of an answer: what has no end would fill the memory before its time is over."""
 EXTRA_OF_MODULE = {
     "pyarrow": "host",
     "scipy": "host",
@@ -57,6 +60,21 @@ def call_plugin(
         if extra is not None:
             raise extra from error
         raise PluginError(f"{blame(error, function)}: {name}(): {said(error)}") from error
+
+
+def unfolded(found: Any) -> Any:
+    """
+    Return a list of what a generator, or another iterable, gives: a generator does its work only then.
+
+    Raises:
+        ValueError: It gives more than ITEMS_MAX.
+    """
+    if isinstance(found, str | Mapping) or not isinstance(found, Iterable):
+        return found
+    items = list(itertools.islice(found, ITEMS_MAX + 1))
+    if len(items) > ITEMS_MAX:
+        raise ValueError(f"it gave more than {ITEMS_MAX} values; is there an end?")
+    return items
 
 
 def is_interruption(error: BaseException) -> bool:

@@ -10,7 +10,7 @@ import functools
 import importlib
 import inspect
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,7 +34,7 @@ from madns_runtime.plugin.api import (
     Simulation,
 )
 from madns_runtime.plugin.code_places import place_of
-from madns_runtime.plugin.isolation import call_plugin
+from madns_runtime.plugin.isolation import call_plugin, unfolded
 from madns_runtime.plugin.registry import load_function
 
 OF_SCENARIOS = ("check", "check_actions", "streams", "labels", "device_uses", "place_uses")
@@ -137,7 +137,8 @@ def _asked(
     """
 
     def judge(found: Any) -> Any:
-        found = _unfolded(found) if unfolds else found
+        if unfolds:
+            found = unfolded(list(found) if isinstance(found, Mapping) else found)
         fault = fault_of(found)
         if fault:
             raise PluginError(f"{place_of(function)}: {name}() {fault}")
@@ -297,7 +298,3 @@ def _more_taken(function: Callable[..., Any]) -> tuple[list[str], list[str]]:
     pairs = zip(CHECK_MORE, in_order, strict=False)
     taken = [name for name, _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs)]
     return taken, [name for name in by_name if name in CHECK_MORE]
-
-
-def _unfolded(found: Any) -> Any:
-    return list(found) if isinstance(found, Iterable) and not isinstance(found, str) else found

@@ -10,7 +10,7 @@ import orjson
 
 from madns_runtime.errors import PluginError
 from madns_runtime.plain_values import is_real
-from madns_runtime.protocol.codec import pack
+from madns_runtime.protocol.codec import pack, unpack
 from madns_runtime.protocol.datagram import MESSAGE_BYTES_MAX
 from madns_runtime.recording.encoding import count_not_finite
 
@@ -21,17 +21,17 @@ NOT_FINITE_CHECK = "summary.not_finite"
 
 def initial_data(value: Any) -> Any:
     """
-    Return an agent's initial data, which a message can carry.
+    Return an agent's initial data as they are now: whoever returned them may go on to change them, such as for the next agent.
 
     Raises:
         PluginError: It is no mapping, too large, or holds what messages do not carry.
     """
     if not isinstance(value, Mapping):
         raise PluginError(f"{_kind(value)}: expected a mapping")
-    size = len(pack(value))
-    if size > MESSAGE_BYTES_MAX - 1024:
-        raise PluginError(f"{size} bytes: expected at most {MESSAGE_BYTES_MAX - 1024}")
-    return value
+    packed = pack(value)
+    if len(packed) > MESSAGE_BYTES_MAX - 1024:
+        raise PluginError(f"{len(packed)} bytes: expected at most {MESSAGE_BYTES_MAX - 1024}")
+    return unpack(packed)
 
 
 def medium(value: Any) -> Any:

@@ -217,8 +217,13 @@ class Link:
         fault = self._seal.find_fault(data) or self._accept(data, now_s)
         if fault is None:
             return True
-        self._counters.refused[fault] += 1
+        self.refuse(fault)
         return False
+
+    def refuse(self, reason: str) -> None:
+        """Count a datagram that is refused."""
+        refused = self._counters.refused
+        refused[reason] = refused.get(reason, 0) + 1
 
     def _accept(self, data: bytes, now_s: float) -> str | None:
         """Take a datagram that is the peer's; return why not, if not, having changed nothing."""

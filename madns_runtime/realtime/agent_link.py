@@ -102,7 +102,7 @@ class AgentPort:
 
     def listen(self, take: Callable[[bytes], None]) -> None:
         """Hand the datagrams for this agent to *take*."""
-        self.process.listen(self.session.identity.index, take)
+        self.process.listen(self.session.identity.index, take, self.session.link.refuse)
 
     def flush(self) -> None:
         """Send what is due, and arm the session's timer."""

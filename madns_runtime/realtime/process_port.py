@@ -6,6 +6,7 @@ What its agents send together leaves as one packet, and what comes is dealt out.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from time import monotonic
@@ -35,6 +36,10 @@ PACKETS_BATCH_MAX = 64
 """Packets taken from the socket in a row before timers get their turn."""
 MOVED_S = 10e-6
 """A clock that has moved by more before simulated time begins has the first ticks' timers set anew."""
+
+
+LEFT = "old_incarnation"
+"""Reason of a refusal, as at the host."""
 
 
 class ProcessPort:
@@ -70,6 +75,9 @@ class ProcessPort:
         self._is_open = False
         self._is_frozen = False
         self._takers: dict[int, Callable[[bytes], None]] = {}
+        self._refusals: dict[int, Callable[[str], None]] = {}
+        self._left: set[int] = set()
+        """Agents that have ended here: the host sends to them until it knows."""
         self._packets_max = PACKETS_BATCH_MAX if agents > 1 else 1
         self.after_packet: Callable[[], None] | None = None
         """Called when packets that came have been dealt out."""
@@ -111,16 +119,31 @@ class ProcessPort:
 
     # Receiving.
 
-    def listen(self, agent_index: int, take: Callable[[bytes], None]) -> None:
-        """Hand the datagrams for an agent, by its index on the wire, to *take*."""
+    def listen(
+        self,
+        agent_index: int,
+        take: Callable[[bytes], None],
+        refuse: Callable[[str], None] = lambda reason: None,
+    ) -> None:
+        """
+        Listen for an agent.
+
+        Args:
+            agent_index: Its index on the wire.
+            take: Is handed the datagrams for it, and those that are nobody's.
+            refuse: Counts a datagram that is for an agent which has left, by the reason.
+        """
         if not self._is_open:
             self._is_open = True
             self._reactor.add_reader(self.socket.fileno(), self._readable)
-        self._takers[agent_index] = take
+        self._takers[agent_index], self._refusals[agent_index] = take, refuse
+        self._left.discard(agent_index)
 
     def leave(self, agent_index: int) -> None:
         """Listen for an agent no more; the last one closes the socket."""
         self._takers.pop(agent_index, None)
+        self._refusals.pop(agent_index, None)
+        self._left.add(agent_index)
         self.close_if_unused()
 
     def close_if_unused(self) -> None:
@@ -162,7 +185,12 @@ class ProcessPort:
 
     def _give(self, datagram: bytes) -> None:
         takers = self._takers
-        take = takers.get(agent_index_of(datagram))
+        index = agent_index_of(datagram)
+        take = takers.get(index)
+        if take is None and index in self._left:
+            for refuse in itertools.islice(self._refusals.values(), 1):
+                refuse(LEFT)
+            return
         if take is None:
             # Nobody's: refused, and counted, by whoever is first.
             take = next(iter(takers.values()), None)

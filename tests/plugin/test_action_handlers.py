@@ -2,9 +2,15 @@
 
 from typing import Any
 
-from madns_runtime.plugin.action_handlers import DeviceFaults
+import pytest
+
+from madns_runtime.config import Agents as AgentSettings
+from madns_runtime.config import RunConfig
+from madns_runtime.faults.intended_losses import IntendedLosses
+from madns_runtime.plugin.action_handlers import DeviceFaults, timeline_runner
 from madns_runtime.protocol.messages import ActionOrder
-from madns_runtime.timeline.action import TimelineAction
+from madns_runtime.timeline.action import ActionKind, TimelineAction
+from madns_runtime.timeline.runner import OrderedAction
 
 
 class Agents:
@@ -69,3 +75,41 @@ def test_a_fault_whose_agents_are_all_away_at_its_end_is_no_refusal() -> None:
     agents.away.add("a")
 
     assert faults.end(a_fault(0, "a")) == ["a"]
+
+
+@pytest.mark.parametrize("carried_out_by", ["host", "agent"])
+def test_agents_that_a_simulations_action_loses_are_told_whichever_half_carries_it_out(
+    carried_out_by: Any,
+) -> None:
+    agents = Agents("c")
+    intended = IntendedLosses()
+    kinds = [
+        ActionKind(
+            word=word, summary="x", carried_out_by=carried_out_by, loses_agents=word == "sink"
+        )
+        for word in ("sink", "float")
+    ]
+    config = RunConfig(
+        run="0001-t",
+        scenario="t",
+        simulation="x",
+        base_directory=".",
+        agents=AgentSettings(count=3),
+    )
+    runner, _ = timeline_runner(
+        config,
+        kinds,
+        {},
+        record=lambda *_, **__: None,
+        call=lambda *_: None,
+        post=agents.post,
+        stop=lambda: None,
+        intended=intended,
+    )
+
+    runner.order(OrderedAction(word="float", agents=("a",), parameters={}), 1.0)
+    before = intended.names()
+    runner.order(OrderedAction(word="sink", agents=("b", "c"), parameters={}), 2.0)
+
+    assert before == []
+    assert intended.names() == (["b"] if carried_out_by == "agent" else ["b", "c"])

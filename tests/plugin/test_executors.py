@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 
 import numpy as np
@@ -429,6 +429,33 @@ def test_jobs_that_come_too_late_are_counted():
     runner.close()
 
     assert said == [("warning", "3 of the executor's jobs not done when simulated time was over")]
+
+
+class Cancelling(ThreadPoolExecutor):
+    """Somebody's executor that gives a job up, as one does that has lost its workers."""
+
+    def submit(self, function, /, *arguments, **keywords):
+        future = Future()
+        future.cancel()
+        return future
+
+
+def test_a_job_that_an_executor_cancels_is_handed_to_whoever_awaits_it():
+    reactor = Reactor()
+    handed = []
+
+    def done(job, future):
+        handed.append((job, future.cancelled()))
+        reactor.stop()
+
+    runner = JobRunner(reactor, Cancelling(1), done)
+    reactor.call_at(reactor.now_s() + PATIENCE_S, reactor.stop)
+
+    runner.submit(math.sqrt, 4.0)
+    reactor.run()
+
+    assert handed == [(1, True)]
+    assert runner.pending_count == 0
 
 
 class Stubborn(ThreadPoolExecutor):

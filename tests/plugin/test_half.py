@@ -108,6 +108,23 @@ def test_what_a_call_returns_against_its_contract_is_refused(logged):
         made(Rover, logged).call("finish")
 
 
+def test_initial_data_are_those_of_the_call_whatever_the_half_does_with_them_afterwards(logged):
+    class Reusing(Base):
+        data: dict[str, Any] = {"place": [0.0], "names": []}
+
+        def initial_data(self, agent: str) -> Any:
+            self.data["place"][0] += 1.0
+            self.data["names"].append(agent)
+            return self.data
+
+    half = made(Reusing, logged, HostHalf)
+
+    of_a, of_b = (half.call("initial_data", agent) for agent in "ab")
+
+    assert of_a == {"place": [1.0], "names": ["a"]}
+    assert of_b == {"place": [2.0], "names": ["a", "b"]}
+
+
 def test_a_half_lets_go_of_what_outlives_it_once_its_setup_was_called(logged):
     class Holding(Rover):
         def abandon(self) -> None:
@@ -234,6 +251,14 @@ def test_the_value_of_a_job_is_handed_in(logged):
     half.take_job(4, future_of("truth"))
 
     assert half.simulation.got == (4, "truth")
+
+
+def test_a_job_that_somebodys_executor_cancels_is_told(logged):
+    future: Future[Any] = Future()
+    future.cancel()
+
+    with pytest.raises(HalfFailed, match=r"^Base: job 4: the executor has cancelled it$"):
+        made(Base, logged, HostHalf).take_job(4, future)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import textwrap
 import pytest
 
 from madns_runtime.errors import PluginError
-from madns_runtime.plugin import code_places, registry
+from madns_runtime.plugin import code_places, isolation, registry
 from madns_runtime.plugin.queries import (
     ask_check,
     ask_demand,
@@ -408,3 +408,24 @@ def test_ctrl_c_during_a_question_is_no_fault_of_the_plugin(plugin, monkeypatch)
 
     with pytest.raises(KeyboardInterrupt):
         ask(path, "check")
+
+
+def test_answers_without_end_are_told_before_they_fill_the_memory(plugin, monkeypatch):
+    monkeypatch.setattr(isolation, "ITEMS_MAX", 1000)
+    path = plugin(
+        """
+        yielded = []
+        def streams(parameters, agents):
+            while True:
+                yielded.append(1)
+                yield None
+        """
+    )
+
+    with pytest.raises(
+        PluginError, match=r"plugin.py:\d+: streams\(\): ValueError: it gave more than 1000"
+    ):
+        ask_streams(f"{path}:streams", path.parent, parameters=None, agents=("a",))
+
+    module = registry.load_object(f"{path}:streams", path.parent)[0]
+    assert len(module.yielded) == 1001

@@ -9,7 +9,7 @@ import pytest
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError, PluginError
 from madns_runtime.hardware import kind_registry
-from madns_runtime.plugin import registry
+from madns_runtime.plugin import registry, time_limit
 from madns_runtime.plugin.api import Simulation
 
 PLUGIN = """
@@ -203,6 +203,26 @@ def test_missing_module_in_a_file_is_shown_with_its_line(write, tmp_path):
     message = refusal("./plugin.py:simulation", tmp_path)
 
     assert message == f"{path}:2: No module named 'no_such_module_at_all'"
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("os._exit(0)", "it called os._exit(0)"),
+        ("while True: pass", "it was not done within 0.2 s"),
+    ],
+)
+def test_installed_module_that_is_stopped_while_it_is_imported_is_told_with_its_own_line(
+    tmp_path, monkeypatch, line, told
+):
+    (tmp_path / "stopped_while_imported.py").write_text(f"import os\n\n{line}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(time_limit, "_limit_s", 0.2)
+
+    with pytest.raises(PluginError) as caught:
+        registry.resolve("stopped_while_imported:simulation", tmp_path)
+
+    assert f"{tmp_path}/stopped_while_imported.py:3: {told}" in str(caught.value)
 
 
 def test_missing_extra_names_the_command_that_installs_it(write, tmp_path, monkeypatch):

@@ -122,6 +122,29 @@ def test_what_is_nobodys_is_refused_by_the_first(host, packet):
     assert (first, second) == ([packet], [])
 
 
+def test_what_is_for_an_agent_that_has_left_is_told_as_such_and_no_foreign_datagram(host):
+    loop = Loop()
+    port = port_of(host, 3, loop)
+    taken, refused = [], []
+    port.listen(7, taken.append, refused.append)
+    port.listen(8, taken.append)
+    port.send(b"hello")
+    _, address = host.recvfrom(2048)
+    port.leave(8)
+
+    for index in (8, 9):
+        host.sendto(datagram(index), address)
+        loop.turn()
+    first = list(taken)
+    port.listen(8, taken.append)  # it returns
+    host.sendto(datagram(8, b"y"), address)
+    loop.turn()
+
+    assert first == [datagram(9)]  # nobody's ever
+    assert refused == ["old_incarnation"]
+    assert taken[1:] == [datagram(8, b"y")]
+
+
 def test_what_is_sent_in_a_block_leaves_together_and_in_order(host):
     port = port_of(host, 3)
     port.begin()

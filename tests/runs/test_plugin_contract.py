@@ -29,6 +29,10 @@ class H(HostSimulation):
         self.context, self.evil = context, context.parameters.evil
 
     def initial_data(self, agent):
+        if self.evil == "reused":
+            self.data = getattr(self, "data", {})
+            self.data["whose"] = agent
+            return self.data
         return {1, 2} if self.evil == "initial_data" else {}
 
     def receive(self, agent, message):
@@ -88,6 +92,7 @@ class A(AgentSimulation):
 
     def setup(self, context, initial):
         self.context, self.evil, self.pid = context, context.parameters.evil, os.getpid()
+        self.initial = initial
 
     def step(self, tick):
         if os.getpid() != self.pid:
@@ -111,6 +116,8 @@ class A(AgentSimulation):
             self.context.send(HOST, 1, "SYNC")
 
     def finish(self):
+        if self.evil == "reused":
+            return self.initial
         return {"set": {1, 2}} if self.evil == "agent_finish" else {}
 
 simulation = Simulation(name="evil", parameters=Parameters, host=":H", agent=":A")
@@ -235,6 +242,17 @@ def test_the_timer_is_given_the_times_it_asked_for_however_late_it_is(tmp_path, 
     assert start_s == -0.5
     assert times_s[:20] == pytest.approx([-0.45 + 0.05 * number for number in range(20)])
     assert (told["late_s"] > 0.0) == (mode == "realtime")
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_each_agent_is_given_its_own_initial_data_though_the_host_returns_one_mapping(
+    tmp_path, mode
+):
+    result = run(tmp_path, "reused", f"time.mode={mode}")
+
+    assert result["simulation"]["agents"] == {
+        name: {"whose": name} for name in ("agent-01", "agent-02")
+    }
 
 
 def test_broken_sync_deadline_breaks_its_check(tmp_path):

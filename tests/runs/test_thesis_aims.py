@@ -85,7 +85,11 @@ def judged(file, stream, field, values):
     table = SameForAll(stream, agents, {"t_s": t_s, field: np.asarray(values)}, declared)
     about = [each for each in file.expectations if (each.stream, each.field) == (stream, field)]
     found = judge_expectations(
-        about, {stream: table}, is_lockstep=False, duration_s=scenario.time.duration_s
+        about,
+        {stream: table},
+        agents=agents,
+        is_lockstep=False,
+        duration_s=scenario.time.duration_s,
     )
     return {each.name: each.passed for each in found.results}
 

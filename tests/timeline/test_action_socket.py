@@ -1,7 +1,9 @@
 """The door for actions in a living run: what it answers comes whole, however much there is to tell."""
 
+import dataclasses
 import selectors
 import socket
+from typing import Any
 
 import orjson
 import pytest
@@ -13,6 +15,7 @@ from madns_runtime.hardware.action_socket import (
     SOCKET_NAME,
     ActionSocket,
 )
+from madns_runtime.timeline.action import ActionKind
 from madns_runtime.timeline.kinds import kinds_by_word
 
 AGENTS = [f"agent-{number:04}" for number in range(1000)]
@@ -35,12 +38,12 @@ class Loop:
             key.data()
 
 
-def answer_to(order, folder, in_force=(), begin=lambda _: ""):
+def answer_to(order, folder, in_force=(), begin=lambda _: "", declared=()):
     loop = Loop()
     door = ActionSocket(
         folder,
         loop,
-        kinds=kinds_by_word(),
+        kinds=kinds_by_word(declared),
         agents=AGENTS,
         devices=("gps",),
         begin=begin,
@@ -101,6 +104,38 @@ def test_a_fault_of_a_device_that_no_agent_would_carry_out_is_refused(tmp_path, 
 
     assert answer == {"refusal": refusal}
     assert len(ordered) == (not refusal)
+
+
+@dataclasses.dataclass(frozen=True)
+class Valve:
+    """Parameters of a plug-in that was not careful: no scenario's timeline names its action."""
+
+    opening: float = 1.0
+    more: Any = b"x"
+
+    def __post_init__(self):
+        if self.opening > 5.0:
+            raise KeyError("wide")
+
+
+@pytest.mark.parametrize(
+    ("given", "refusal"),
+    [
+        ({}, "open_valve: its parameters cannot be told: Type is not JSON serializable: bytes"),
+        ({"opening": 7.0}, "open_valve: Valve cannot be made: KeyError('wide')"),
+    ],
+)
+def test_an_order_that_a_plugins_own_parameters_do_not_take_is_refused_and_the_run_goes_on(
+    tmp_path, given, refusal
+):
+    kind = ActionKind(word="open_valve", summary="x", parameters=Valve, takes_agents=False)
+    order = {"action": "open_valve", "target": "run", "parameters": given}
+
+    answer = answer_to(order, tmp_path, declared=(kind,))
+    other = answer_to({**order, "parameters": {"more": 1}}, tmp_path, declared=(kind,))
+
+    assert answer == {"refusal": refusal}
+    assert other["refusal"] == ""
 
 
 def test_a_long_order_is_judged_as_any_other(tmp_path):

@@ -30,6 +30,7 @@ from cosmos_cli.evidence.expectations.outcomes import (
 )
 from cosmos_cli.evidence.expectations.records import Batch, RecordSource
 from cosmos_cli.evidence.expectations.seen_words import SeenWords
+from cosmos_cli.evidence.expectations.strangers import Strangers
 from cosmos_cli.evidence.verdict import CheckResult
 from cosmos_cli.models.expectation import Expectation, HeldBounds, scaled
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY
@@ -56,11 +57,13 @@ class JudgedExpectations:
     """By name of the others: why."""
     unseen: tuple[str, ...] = ()
     """Remarks on words that are looked for and that no record has, where any may come: they may be misspelt."""
+    of_strangers: tuple[str, ...] = ()
+    """Remarks on records about names that are no agents: expectations of agents do not judge them."""
 
     def remarks(self) -> tuple[str, ...]:
-        """Return a remark per expectation that was not judged, and per event whose word is nowhere."""
+        """Return a remark per expectation that was not judged, per event whose word is nowhere, and on records left out."""
         told = (f"{name}: not judged: {why}" for name, why in self.not_judged.items())
-        return (*told, *self.unseen)
+        return (*told, *self.unseen, *self.of_strangers)
 
     def told_not_judged(self) -> list[dict[str, str]]:
         """Return the same as run.json holds it."""
@@ -79,7 +82,12 @@ class JudgedExpectations:
 
 
 def judge_expectations(
-    expectations: Sequence[Expectation], tables: Tables, *, is_lockstep: bool, duration_s: float
+    expectations: Sequence[Expectation],
+    tables: Tables,
+    *,
+    agents: Sequence[str],
+    is_lockstep: bool,
+    duration_s: float,
 ) -> JudgedExpectations:
     """
     Judge expectations over all records.
@@ -87,6 +95,7 @@ def judge_expectations(
     Args:
         expectations: Of the run, in their order.
         tables: The run's.
+        agents: Names of its agents.
         is_lockstep: Its time mode.
         duration_s: Its simulated time, s.
     """
@@ -95,12 +104,14 @@ def judge_expectations(
     judged = [each for each in expectations if each.name not in not_judged]
     followed = [_Followed(each, source, duration_s) for each in judged]
     by_stream: dict[str, list[_Followed]] = {}
+    strangers = Strangers(agents)
     for each in followed:
         by_stream.setdefault(each.expectation.stream, []).append(each)
     for stream, own in by_stream.items():
         fields = list(dict.fromkeys(each.expectation.field for each in own))
         for batch in source.batches(stream, [name for name in fields if name]):
             _give(batch, own)
+            strangers.take(stream, batch)
     earlier: dict[str, _Earlier] = {}
     results = []
     for each in followed:
@@ -114,6 +125,7 @@ def judge_expectations(
         results=tuple(results),
         not_judged=not_judged,
         unseen=tuple(filter(None, (each.words.remark() for each in followed))),
+        of_strangers=tuple(strangers.remarks(judged)),
     )
 
 

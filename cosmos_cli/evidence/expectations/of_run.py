@@ -55,6 +55,7 @@ def judge_run(
     return judge_expectations(
         expectations,
         tables,
+        agents=config.agents.resolved_names(),
         is_lockstep=config.time.is_lockstep,
         duration_s=min(float(ran_s), planned_s) if is_number(ran_s) and ran_s >= 0 else planned_s,
     )

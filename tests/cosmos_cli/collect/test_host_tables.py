@@ -7,10 +7,17 @@ import re
 import numpy as np
 import pytest
 
-from cosmos_cli.collect.host_tables import tabulated, times_of
+from cosmos_cli.collect.host_tables import (
+    Wanted,
+    layout_with,
+    tabulated,
+    times_of,
+    write_host_table,
+)
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
-from madns_runtime.config import Agents, RunConfig
+from cosmos_cli.evidence.tables import NO_LABELS
+from madns_runtime.config import Agents, RunConfig, Timeouts
 from madns_runtime.errors import PluginError
 
 AGENTS = ("agent-01", "agent-02")
@@ -73,6 +80,7 @@ def rows(folder, change="{}", agents=AGENTS):
         ("{'fields': (Field('x_m', 'm', 'odd'),)}", "expected fields of kind"),
         ("{'columns': {'x_m': np.zeros((3, 2))}}", "must yield a value a time of each of x_m"),
         ("{'columns': {'x_m': np.array(['a'] * 3, object)}}", "could not convert string to float"),
+        ("{'columns': {'x_m': times_s * 1j}}", "x_m: expected real numbers, got complex128"),
     ],
 )
 def test_what_is_no_row_of_an_agent_is_told_with_its_place(tmp_path, change, told):
@@ -120,3 +128,76 @@ def test_rows_in_lists_become_arrays(tmp_path):
     assert [part.agent for part in found] == list(AGENTS)
     assert [part.columns["x_m"].tolist() for part in found] == [[1.0, 2.0, 3.0]] * 2
     assert found[0].times_s.dtype == np.float64
+
+
+def written(folder, change="{}", before="pass", told=lambda what, share: None):
+    """Write the table as `cosmos tabulate` does; *before* is done for each agent, before its rows are yielded."""
+    code = PLUGIN.replace("for agent in agents:\n", f"for agent in agents:\n        {before}\n")
+    (folder / "plug.py").write_text("import os, signal, time\n" + code.replace("CHANGE", change))
+    config = RunConfig(
+        run="0001-t",
+        scenario="t",
+        simulation="./plug.py:simulation",
+        base_directory=str(folder),
+        agents=Agents(count=2),
+        timeouts=Timeouts(loading_s=2.0),
+    )
+    layout = layout_with(NO_LABELS)
+    wanted = Wanted(agents=AGENTS, times_s=TIMES_S, path=folder / "out.parquet", layout=layout)
+    return write_host_table(RunDirectory(folder / "0001-t"), config, wanted, told)
+
+
+@pytest.mark.process
+def test_what_a_simulation_prints_while_it_tabulates_is_cleaned_and_leaves_stdout_alone(
+    tmp_path, capfd
+):
+    printing = "os.write(1, b'{} \\x1b[31mred\\x07\\n'); os.write(2, b'\\x1b]0;title\\n')"
+
+    found = written(tmp_path, before=printing)
+    told = capfd.readouterr()
+
+    assert (found.rows, found.gaps) == (6, {})
+    assert told.out == ""
+    assert told.err == "{} \\x1b[31mred\\x07\n\\x1b]0;title\n" * 2
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("before", "told"),
+    [
+        ("os.kill(os.getpid(), signal.SIGKILL)", "tabulate() of ./plug.py:simulation: its process"),
+        (
+            "os.kill(os.getpid(), signal.SIGSEGV) if agent == agents[1] else None",
+            "tabulating agent-01: its process was killed by SIGSEGV without a word",
+        ),
+        ("time.sleep(1000)", "tabulate(): it was not done within 2 s"),
+    ],
+)
+def test_a_simulation_that_ends_its_process_or_hangs_while_it_tabulates_is_told(
+    tmp_path, before, told
+):
+    with pytest.raises(PluginError, match=re.escape(told)):
+        written(tmp_path, before=before)
+
+    assert sorted(path.name for path in tmp_path.glob("*out.parquet*")) == []
+
+
+@pytest.mark.process
+def test_the_progress_of_a_table_is_told_agent_by_agent(tmp_path):
+    told = []
+
+    written(tmp_path, told=lambda what, share: told.append((what, share)))
+
+    assert told == [("tabulating agent-01", 0.0), ("tabulating agent-02", 0.5)]
+
+
+@pytest.mark.process
+def test_what_a_simulation_may_not_yield_and_where_nothing_can_be_written_is_told_as_it_is(
+    tmp_path,
+):
+    with pytest.raises(PluginError, match=r"plug.py:.*must yield rows of the agents"):
+        written(tmp_path, "{'agent': 'nobody'}")
+    (tmp_path / "out.parquet").mkdir()
+
+    with pytest.raises(InputError, match=r"out.parquet: cannot be written"):
+        written(tmp_path)

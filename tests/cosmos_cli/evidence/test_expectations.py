@@ -90,7 +90,9 @@ def expect(**values):
 
 
 def judge(*expectations, tables=TABLES, is_lockstep=True):
-    return judge_expectations(expectations, tables, is_lockstep=is_lockstep, duration_s=DURATION_S)
+    return judge_expectations(
+        expectations, tables, agents=("a", "b"), is_lockstep=is_lockstep, duration_s=DURATION_S
+    )
 
 
 def result_of(**values):
@@ -752,3 +754,33 @@ def test_a_word_that_comes_after_very_many_others_is_there():
     many = {"a": {"t_s": np.arange(150_001.0), "event": objects([*words, "quiet"])}}
 
     assert remarks_on(FakeTable("radio", RADIO.fields, many), event="quiet") == ()
+
+
+def test_records_about_names_that_are_no_agents_are_told_by_checks_that_leave_them_out():
+    about = ["a", "b", "bus-1", "bus-1", "swing"]
+    host = FakeTable(
+        "host_slots",
+        HOST.fields,
+        {
+            "host": {
+                "t_s": np.arange(5.0),
+                "agent": objects(about),
+                "error_deg": np.arange(5.0),
+            }
+        },
+        role="host",
+    )
+    own = {"stream": "slots", "field": "error_deg", "is_of_host": True}
+    bounds = ValueBounds(high=2.0)
+    of_agents = [expect(name=name, bounds=bounds, **own) for name in ("x", "y")]
+    of_all = expect(name="z", agents=("host",), bounds=bounds, **own)
+
+    found = judge(*of_agents, of_all, tables={"host_slots": host})
+
+    assert [each.passed for each in found.results] == [True, True, False]
+    assert found.remarks() == (
+        "stream slots: 3 records about bus-1, swing, which are no agents of the run, are not judged by x, y;"
+        " agents: [host] judges every record",
+    )
+    assert judge(of_all, tables={"host_slots": host}).remarks() == ()
+    assert judge(*of_agents, tables=TABLES).remarks() == ()

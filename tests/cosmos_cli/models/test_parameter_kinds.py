@@ -268,7 +268,7 @@ def test_a_wrong_value_is_told_at_its_place(folder, key, value, told):
 
 ODD = """
 import datetime, decimal, enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Callable, NamedTuple
 from madns_runtime.plugin.api import AgentSimulation, Simulation
 
@@ -381,3 +381,52 @@ def test_default_that_no_message_can_hold_is_refused(tmp_path, kind, default, to
         load_scenario(tmp_path / "a.yaml")
 
     assert f"{tmp_path}/odd.py:" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("default", "told"),
+    [
+        ("object()", "height: expected None, true or false, a number, a text, a list or a mapping"),
+        ("b'abc'", r"got b'abc'; turn it into one of these"),
+        ("complex(1)", "a list or a mapping, got"),
+        ("frozenset((1, 2))", "a list or a mapping, got frozenset"),
+        ("(1, object())", r"height\[1\]: expected None, true or false"),
+        ("__import__('numpy').int64(3)", r"got np.int64\(3\)"),
+        ("field(default_factory=lambda: __import__('numpy').zeros(2))", r"got array\("),
+        ("field(default_factory=lambda: {1: 2})", "height: expected texts as keys, got 1"),
+    ],
+)
+def test_a_default_of_any_kind_that_is_no_value_of_yaml_is_refused(tmp_path, default, told):
+    (tmp_path / "odd.py").write_text(
+        ODD.replace("KIND", "int").replace(
+            "    inner: Inner | None = None\n", f"    height: Any = {default}\n"
+        )
+    )
+    (tmp_path / "a.yaml").write_text("name: a\nsimulation: ./odd.py:simulation\nagents: {count: 1}")
+    with pytest.raises(InputError, match=told) as caught:
+        load_scenario(tmp_path / "a.yaml")
+
+    assert f"{tmp_path}/odd.py:" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "default"),
+    [
+        ("float", "5"),
+        ("Annotated[float, Ge(0)]", "0"),
+        ("tuple[float, ...]", "(5, 1.5)"),
+        ("tuple[tuple[float, float], ...]", "((0, 1), (2, 3))"),
+        ("float | None", "5"),
+    ],
+)
+def test_a_whole_number_does_as_the_default_of_a_float(tmp_path, kind, default):
+    code = PLUGIN.split("class Sail")[0].rsplit("@dataclass", 1)[0] + (
+        "@dataclass(frozen=True, kw_only=True)\n"
+        f"class Parameters:\n    height_m: {kind} = {default}\n\n"
+        "class Boat(AgentSimulation):\n    pass\n\n"
+        'simulation = Simulation(name="boat", parameters=Parameters, agent=":Boat")\n'
+    )
+    (tmp_path / "odd.py").write_text(code)
+    (tmp_path / "a.yaml").write_text("name: a\nsimulation: ./odd.py:simulation\nagents: {count: 1}")
+
+    load_scenario(tmp_path / "a.yaml")

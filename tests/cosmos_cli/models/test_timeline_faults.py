@@ -272,3 +272,69 @@ def test_no_action_has_a_parameter_that_a_timelines_entry_has_itself() -> None:
     assert set(ENTRY_KEYS) == set(RULE_KEYS)
     for kind in FRAMEWORK_ACTIONS:
         assert not {field.name for field in fields(kind.parameters)} & set(RULE_KEYS), kind.word
+
+
+VALVES = """
+from dataclasses import dataclass, field
+from typing import Any
+from madns_runtime.plugin.api import ActionKind, AgentSimulation, Simulation
+
+@dataclass(frozen=True)
+class Parameters:
+    pass
+
+@dataclass(frozen=True)
+class Valve:
+    opening: float = 1
+    FIELD
+
+VALVE = ActionKind(word="open_valve", summary="Opens.", parameters=Valve, takes_agents=False)
+simulation = Simulation(name="tanks", parameters=Parameters, agent=":Tank", actions=(VALVE,))
+
+class Tank(AgentSimulation):
+    pass
+"""
+
+
+def of_tanks(folder: Path, field: str) -> ScenarioFile:
+    """Load a scenario whose simulation has an action with one more parameter."""
+    (folder / "tanks.py").write_text(VALVES.replace("FIELD", field))
+    scenario = "name: a\nsimulation: ./tanks.py:simulation\nagents: {count: 1}\n"
+    (folder / "a.yaml").write_text(f"{scenario}timeline:\n  - {{at_s: 1, action: open_valve}}\n")
+    return load_scenario(folder / "a.yaml")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("field", "told"),
+    [
+        ("more: Any = object()", "more: expected None, true or false, a number, a text"),
+        ("more: Any = float('nan')", "more: expected a finite number, got nan"),
+        ("more: int = 10**30", "more: expected a whole number from -2^63 to 2^63 - 1"),
+        ("more: str = chr(0xDC80)", "more: expected text that UTF-8 can hold"),
+        ("more: Any = field(default_factory=lambda: {1: 2})", "more: expected texts as keys"),
+        ("more: float = 'wide'", "more: expected float, got 'wide'; a default must be of its"),
+        (
+            "def __post_init__(self): object.__setattr__(self, 'opening', self.opening + 1)",
+            "opening came out another",
+        ),
+        ("def __post_init__(self): raise KeyError('x')", "KeyError: 'x'"),
+    ],
+)
+def test_a_default_of_an_actions_parameter_that_no_file_can_hold_is_told_with_the_plugins_line(
+    tmp_path: Path, field: str, told: str
+) -> None:
+    with pytest.raises(InputError) as refused:
+        of_tanks(tmp_path, field)
+
+    (fault,) = refused.value.faults
+    assert fault.path == "timeline[0].action"
+    assert f"{tmp_path}/tanks.py:" in fault.text
+    assert told in fault.text
+
+
+@pytest.mark.process
+def test_defaults_of_an_actions_parameters_are_filled_in(tmp_path: Path) -> None:
+    (found,) = of_tanks(tmp_path, "more: str = 'x'").run_config("0001-x").timeline
+
+    assert found.parameters == {"opening": 1, "more": "x"}

@@ -124,6 +124,14 @@ def test_values_come_through_a_process_of_their_own_as_they_were():
     [
         (lambda: Series(x=[1, 2], y=[1]), "Series: expected one length, got x 2, y 1"),
         (lambda: Series(x=[[1]], y=[1]), "Series.x: expected 1 dimensions, got 2"),
+        (
+            lambda: Series(x=[1, 2], y=np.fft.fft([1.0, 2.0])),
+            "Series.y: expected real numbers, got complex128",
+        ),
+        (
+            lambda: Series(x=np.array(["2026-01-01"], "datetime64[s]"), y=[1]),
+            "Series.x: expected real numbers, got datetime64",
+        ),
         (lambda: Histogram(edges=[1], counts=[1]), "one edge more"),
         (lambda: HeatMap(x=X, y=X, values=np.ones((2, 5)), scale=Axis()), r"shape \(5, 5\)"),
         (lambda: Bars(names=["a"], values=[]), "1 names and 0 values"),
