@@ -39,6 +39,8 @@ def main() -> None:
         code = _supervise(launch, fds, pending)
     except MadnsError as error:
         sys.stderr.write(f"madns-agent: {error}\n")
+    except KeyboardInterrupt:  # before the loop runs, which hears Ctrl-C itself
+        sys.stderr.write("madns-agent: interrupted\n")
     except BaseException:  # noqa: BLE001 - the last frame of a process
         traceback.print_exc()
     sys.stderr.flush()
