@@ -24,6 +24,9 @@ from madns_runtime.realtime.supervisor import Supervisor
 from madns_runtime.recording.access import apply_access
 
 USAGE = "usage: madns-agent [--launch SOCKET]"
+SEAT_TAKEN = (
+    "the run gave nothing to start with: this agent has been started already, or the run is over"
+)
 
 
 def main() -> None:
@@ -33,7 +36,9 @@ def main() -> None:
         fds = _open_line(sys.argv[1:])
         if fds[0] == 0:
             die_with_parent()  # until the loop runs: loading a plug-in may take for ever
-        document, pending = read_launch(fds[0])
+            document, pending = read_launch(0)
+        else:
+            document, pending = read_launch(fds[0], if_none=SEAT_TAKEN)
         launch = from_mapping(AgentLaunch, document)
         apply_access(launch.config.recording.access)
         code = _supervise(launch, fds, pending)
