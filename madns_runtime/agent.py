@@ -17,6 +17,7 @@ import orjson
 
 from madns_runtime.config import AgentLaunch, from_mapping
 from madns_runtime.errors import ConfigurationError, MachineError, MadnsError
+from madns_runtime.private_socket import SOCKET_PATH_BYTES_MAX, socket_address
 from madns_runtime.processes import register
 from madns_runtime.reactor.operator_link import read_launch
 from madns_runtime.reactor.scheduling import die_with_parent
@@ -75,14 +76,24 @@ def _open_line(arguments: list[str]) -> tuple[int, int]:
         raise ConfigurationError(USAGE)
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        connection.connect(arguments[1])
+        _connect(connection, arguments[1])
     except OSError as error:
         raise MachineError(
-            f"cannot reach the run at {arguments[1]}: {error.strerror}; is `cosmos run --manual`"
-            " still waiting?"
+            f"cannot reach the run at {arguments[1]}: {error.strerror or error}; is `cosmos run"
+            " --manual` still waiting?"
         ) from error
     fd = connection.detach()
     return fd, fd
+
+
+def _connect(connection: socket.socket, path: str) -> None:
+    """Connect to a socket at a path of any length."""
+    if len(os.fsencode(path)) <= SOCKET_PATH_BYTES_MAX:
+        connection.connect(path)
+        return
+    directory, name = os.path.split(path)
+    with socket_address(directory, name) as address:
+        connection.connect(address)
 
 
 if __name__ == "__main__":

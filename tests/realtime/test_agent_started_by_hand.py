@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 
 import pytest
+
+from madns_runtime import private_socket
 
 pytestmark = pytest.mark.process
 
 PATIENCE_S = 60.0
 
 
-def test_second_one_for_a_seat_is_told_that_it_is_taken(tmp_path):
-    path = str(tmp_path / "launch")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
-        listener.bind(path)
-        listener.listen()
+@pytest.mark.parametrize("folder", ["short", "long" * 50])
+def test_second_one_for_a_seat_is_told_that_it_is_taken(tmp_path, folder):
+    (tmp_path / folder).mkdir()
+    with private_socket.listen(tmp_path / folder, "launch", 1) as listener:
+        path = str(tmp_path / folder / "launch")
         command = [sys.executable, "-P", "-m", "madns_runtime.agent", "--launch", path]
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as agent:
             listener.settimeout(PATIENCE_S)
