@@ -110,7 +110,7 @@ class Network(ScenarioSection):
     """Address that the host binds and agents send to."""
     port: Annotated[int, Ge(0), Le(65535)] = 0
     """UDP port of the host; 0 lets the kernel choose a free one."""
-    receive_buffer_bytes: Annotated[int, Ge(16_384)] = 4 * 1024 * 1024
+    receive_buffer_bytes: Annotated[int, Ge(16_384), Le(2**31 - 1)] = 4 * 1024 * 1024
     """Socket receive buffer that is asked for; a smaller one is granted with a warning."""
 
 
