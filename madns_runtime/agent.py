@@ -17,6 +17,7 @@ import orjson
 
 from madns_runtime.config import AgentLaunch, from_mapping
 from madns_runtime.errors import ConfigurationError, MachineError, MadnsError
+from madns_runtime.private_socket import SOCKET_PATH_BYTES_MAX, socket_address
 from madns_runtime.processes import register
 from madns_runtime.reactor.operator_link import read_launch
 from madns_runtime.reactor.scheduling import die_with_parent
@@ -24,6 +25,9 @@ from madns_runtime.realtime.supervisor import Supervisor
 from madns_runtime.recording.access import apply_access
 
 USAGE = "usage: madns-agent [--launch SOCKET]"
+SEAT_TAKEN = (
+    "the run gave nothing to start with: this agent has been started already, or the run is over"
+)
 
 
 def main() -> None:
@@ -33,12 +37,16 @@ def main() -> None:
         fds = _open_line(sys.argv[1:])
         if fds[0] == 0:
             die_with_parent()  # until the loop runs: loading a plug-in may take for ever
-        document, pending = read_launch(fds[0])
+            document, pending = read_launch(0)
+        else:
+            document, pending = read_launch(fds[0], if_none=SEAT_TAKEN)
         launch = from_mapping(AgentLaunch, document)
         apply_access(launch.config.recording.access)
         code = _supervise(launch, fds, pending)
     except MadnsError as error:
         sys.stderr.write(f"madns-agent: {error}\n")
+    except KeyboardInterrupt:  # before the loop runs, which hears Ctrl-C itself
+        sys.stderr.write("madns-agent: interrupted\n")
     except BaseException:  # noqa: BLE001 - the last frame of a process
         traceback.print_exc()
     sys.stderr.flush()
@@ -68,14 +76,24 @@ def _open_line(arguments: list[str]) -> tuple[int, int]:
         raise ConfigurationError(USAGE)
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        connection.connect(arguments[1])
+        _connect(connection, arguments[1])
     except OSError as error:
         raise MachineError(
-            f"cannot reach the run at {arguments[1]}: {error.strerror}; is `cosmos run --manual`"
-            " still waiting?"
+            f"cannot reach the run at {arguments[1]}: {error.strerror or error}; is `cosmos run"
+            " --manual` still waiting?"
         ) from error
     fd = connection.detach()
     return fd, fd
+
+
+def _connect(connection: socket.socket, path: str) -> None:
+    """Connect to a socket at a path of any length."""
+    if len(os.fsencode(path)) <= SOCKET_PATH_BYTES_MAX:
+        connection.connect(path)
+        return
+    directory, name = os.path.split(path)
+    with socket_address(directory, name) as address:
+        connection.connect(address)
 
 
 if __name__ == "__main__":

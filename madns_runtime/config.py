@@ -110,7 +110,7 @@ class Network(ScenarioSection):
     """Address that the host binds and agents send to."""
     port: Annotated[int, Ge(0), Le(65535)] = 0
     """UDP port of the host; 0 lets the kernel choose a free one."""
-    receive_buffer_bytes: Annotated[int, Ge(16_384)] = 4 * 1024 * 1024
+    receive_buffer_bytes: Annotated[int, Ge(16_384), Le(2**31 - 1)] = 4 * 1024 * 1024
     """Socket receive buffer that is asked for; a smaller one is granted with a warning."""
 
 
@@ -162,7 +162,7 @@ class Scheduling(ScenarioSection):
 class Recording(ScenarioSection):
     """Settings of the records and of their way to the disk."""
 
-    flush_interval_s: Annotated[float, Gt(0), Le(60)] = 0.25
+    flush_interval_s: Annotated[float, Ge(1e-3), Le(60)] = 0.25
     """The most that a killed process loses, s."""
     sync_interval_s: Annotated[float, Ge(0), Le(600)] | None = None
     """Time between syncs to the disk, s: what a power cut costs at most; 0 leaves it to the kernel. Not given: 5 on other machines, 0 on this one."""

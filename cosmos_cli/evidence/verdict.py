@@ -274,11 +274,13 @@ def first_line(text: str) -> str:
 
 
 def _why_no_result(problems: Sequence[str]) -> str:
-    """Return what the operator saw of the host's end, as in: host (pid 7) was killed by SIGKILL."""
+    """Return what the operator saw of the host, as in: host (pid 7) was killed by SIGKILL; host cannot be started."""
     for problem in problems:
         name, _, what = problem.partition(") ")
         if name.startswith("host (pid ") and what:
             return what
+        if problem.startswith("host cannot "):
+            return problem.removeprefix("host ")
     return "it ended without a result; was it killed?"
 
 

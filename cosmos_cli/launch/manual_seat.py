@@ -10,6 +10,7 @@ from __future__ import annotations
 import selectors
 import shlex
 import shutil
+import socket
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
@@ -20,6 +21,7 @@ from cosmos_cli.launch.channel import PipeChannel
 from madns_runtime import private_socket
 
 BACKLOG = 4
+FOLDER_PREFIX = "cosmos-"
 
 
 class ManualSeat:
@@ -49,17 +51,29 @@ class ManualSeat:
         self._on_line = on_line
         self._on_presence = on_presence
         self.channel: PipeChannel | None = None
-        # Not in the run directory: a socket's path holds 108 bytes at most.
-        self._folder = Path(tempfile.mkdtemp(prefix="cosmos-"))
-        self.path = self._folder / "launch"
-        self._listener = private_socket.listen(self._folder, self.path.name, BACKLOG)
-        self._is_open = True
-        selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        self._folder = Path()
+        self._listener: socket.socket | None = None
 
-    def command(self) -> str:
-        """Return what to type into a shell."""
-        arguments = (sys.executable, "-P", "-m", "madns_runtime.agent", "--launch", str(self.path))
-        return shlex.join(arguments)
+    def open(self) -> str:
+        """
+        Let an agent in, and return what to type into a shell.
+
+        Raises:
+            OSError: There can be no socket for it.
+        """
+        # Not in the run directory: a socket's path holds 108 bytes at most.
+        folder = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX))
+        path = folder / "launch"
+        try:
+            listener = private_socket.listen(folder, path.name, BACKLOG)
+        except OSError:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        self._folder, self._listener = folder, listener
+        self._selector.register(listener, selectors.EVENT_READ, self._accept)
+        return shlex.join(
+            (sys.executable, "-P", "-m", "madns_runtime.agent", "--launch", str(path))
+        )
 
     def send(self, command: Mapping[str, Any]) -> None:
         """Send a command to whoever is connected."""
@@ -68,10 +82,10 @@ class ManualSeat:
 
     def stop_listening(self) -> None:
         """Let nobody in any more."""
-        if self._is_open:
-            self._is_open = False
+        if self._listener is not None:
             self._selector.unregister(self._listener)
             self._listener.close()
+            self._listener = None
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def close(self) -> None:
@@ -82,7 +96,7 @@ class ManualSeat:
             self.channel = None
 
     def _accept(self, mask: int) -> None:
-        connection = private_socket.accept(self._listener)
+        connection = None if self._listener is None else private_socket.accept(self._listener)
         if connection is None:
             return
         if self.channel is not None:

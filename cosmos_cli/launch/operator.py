@@ -370,10 +370,15 @@ class Operator:
                 happened.ManualAgentJoined(agent) if is_here else happened.ManualAgentLeft(agent)
             ),
         )
+        try:
+            command = seat.open()
+        except OSError as error:
+            self._post(happened.StartFailed(agent, None, f"no socket for it: {error}"))
+            return
         within_s = self._request.config.timeouts.agents_ready_s
         named = self._request.labels.named(agent)
         text = f"start {named} by hand within {within_s:g} s, in another terminal:"
-        self._view.say(f"{text}\n  {seat.command()}", "manual")
+        self._view.say(f"{text}\n  {command}", "manual")
 
 
 def _stderr_of(name: str, machine: str | None) -> str:

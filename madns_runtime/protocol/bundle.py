@@ -62,9 +62,9 @@ def is_bundle(packet: bytes) -> bool:
 
 
 def split(packet: bytes) -> list[bytes] | None:
-    """Return the datagrams of a bundle; None if it is malformed: too long, cut, or with a piece that can be none."""
+    """Return the datagrams of a bundle; None if it is malformed: empty, too long, cut, or with a piece that can be none."""
     end = len(packet)
-    if end > DATAGRAM_BYTES_MAX:
+    if not len(_MARK) < end <= DATAGRAM_BYTES_MAX:
         return None
     datagrams = []
     at = len(_MARK)

@@ -48,10 +48,16 @@ PING_SILENCE_S = 30.0
 PING_LATE_S = 2.0
 """Pings come every second; after this long without one something is wrong between here and there."""
 
+LAUNCH_CUT = "the launch document on standard input is empty, cut or too long"
 
-def read_launch(fd: int) -> tuple[dict[str, Any], bytes]:
+
+def read_launch(fd: int, *, if_none: str = LAUNCH_CUT) -> tuple[dict[str, Any], bytes]:
     """
     Read the launch document: the first line on *fd*.
+
+    Args:
+        fd: Where it comes from.
+        if_none: What it means that there is none.
 
     Returns:
         The document, and what had already come behind it.
@@ -75,9 +81,7 @@ def read_launch(fd: int) -> tuple[dict[str, Any], bytes]:
         chunk = os.read(fd, READ_BYTES)
         size += len(chunk)
         if not chunk or size > LINE_BYTES_MAX:
-            raise ConfigurationError(
-                "the launch document on standard input is empty, cut or too long"
-            )
+            raise ConfigurationError(LAUNCH_CUT if parts else if_none)
         parts.append(chunk)
     line, rest = b"".join(parts).split(b"\n", 1)
     try:

@@ -72,13 +72,14 @@ class Supervisor:
 
     Args:
         launch: Which agents, and where the host is.
-        fds: Where the operator's commands come from and events go to.
+        fds: Where the operator's commands come from and events go to; one and the same of who was started by hand.
         pending: What had already come behind the launch document.
     """
 
     def __init__(self, launch: AgentLaunch, fds: tuple[int, int], pending: bytes) -> None:
         config = launch.config
         self._launch = launch
+        self._is_by_hand = fds[0] == fds[1]
         # Loaded before the forks: the children share the parent's pages.
         self._program = RoleProgram.load(config, "agent", tell=partial(tell_loading, fds[1]))
         machine_directory = Path(launch.directory) / "machines" / launch.machine
@@ -127,7 +128,8 @@ class Supervisor:
         reactor = self._reactor
         reactor.on_signal(signal.SIGCHLD, self._reap)
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
-        reactor.on_signal(signal.SIGINT, lambda: None)  # a terminal's Ctrl-C is the operator's
+        # A terminal's Ctrl-C is the operator's, but for who was started by hand, on a terminal of its own.
+        reactor.on_signal(signal.SIGINT, lambda: self._end("SIGINT") if self._is_by_hand else None)
         reactor.add_reader(self._reason_read_fd, self._read_outcomes)
         self._devices.watch(reactor, self._operator.emit)
         self._reap()

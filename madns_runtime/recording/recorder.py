@@ -24,7 +24,7 @@ from madns_runtime.recording.text_file import TextFile
 from madns_runtime.recording.writer_thread import RecordWriter, WriterThread
 
 WAKE_BYTES = 65_536
-"""The writer is woken early when this much waits."""
+"""The writer is woken early when this much waits, or half of what may."""
 CLOSE_TIMEOUT_S = 10.0
 
 
@@ -64,6 +64,7 @@ class Recorder:
         self._files = files
         self._writer = writer or WriterThread(settings).writes(files)
         self._limit_bytes = settings.buffer_bytes
+        self._wake_bytes = min(WAKE_BYTES, settings.buffer_bytes // 2)
         self._queued_bytes = 0
         self._streams: dict[str, StreamFile] = {}
         self._texts: dict[str, TextFile] = {}
@@ -177,14 +178,18 @@ class Recorder:
             self._files.add_error(str(error))
 
     def _queue(self, file: StreamFile, line: bytes) -> None:
-        queued_bytes = self._queued_bytes + len(line) + LINE_OVERHEAD_BYTES
+        line_bytes = len(line) + LINE_OVERHEAD_BYTES
+        queued_bytes = self._queued_bytes + line_bytes
         waiting_bytes = queued_bytes - self._files.freed_bytes
         if waiting_bytes > self._limit_bytes:
-            file.overflowed += 1
-            return
+            if line_bytes <= self._limit_bytes:
+                self._writer.flush()  # one that writes at once makes room for it
+            if queued_bytes - self._files.freed_bytes > self._limit_bytes:
+                file.overflowed += 1
+                return
         self._queued_bytes = queued_bytes
         file.lines.append(line)
-        if waiting_bytes > WAKE_BYTES:
+        if waiting_bytes > self._wake_bytes:
             self._writer.flush()
 
     def flush(self) -> None:

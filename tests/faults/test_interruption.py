@@ -147,7 +147,8 @@ def start_by_hand(run: Run) -> subprocess.Popen[bytes]:
     """Do what the operator asks for: type the command that it prints."""
     asked = r"start agent-02 by hand within .*\n +(.*)\n"
     command = run.wait_until(lambda: re.search(asked, run.talk), "command to type")[1]
-    return subprocess.Popen(shlex.split(command), env=run.laboratory.environment)
+    environment = run.laboratory.environment
+    return subprocess.Popen(shlex.split(command), env=environment, process_group=0)
 
 
 def test_agent_started_by_hand_joins_the_run(laboratory):
@@ -169,6 +170,18 @@ def test_hand_started_agent_that_is_killed_is_lost(laboratory):
         by_hand.kill()
 
         check_ending(run, 1, "failed", "FAILED: agent-02: ")
+
+
+def test_ctrl_c_on_a_terminal_of_its_own_ends_an_agent_started_by_hand(laboratory):
+    run = laboratory.start(*LONG, *CLEAN, "--manual", "agent-02")
+    with start_by_hand(run) as by_hand:
+        run.wait_until_running()
+        os.killpg(by_hand.pid, signal.SIGINT)
+
+        document = check_ending(run, 1, "failed", "FAILED: agent-02: ")
+        assert by_hand.wait(PATIENCE_S) == 1
+    assert "agent-02: ending: SIGINT" in run.talk
+    assert document["data"]["missing"] == []
 
 
 def test_ctrl_c_while_an_agent_is_awaited_ends_the_run(laboratory):

@@ -48,8 +48,9 @@ def test_a_datagram_by_itself_is_not_wrapped():
         bytes([BUNDLE]) + (OVERHEAD_BYTES + 1).to_bytes(2, "little") + bytes(OVERHEAD_BYTES),
         bytes([BUNDLE]) + bytes(2),
         bytes([BUNDLE]) * (DATAGRAM_BYTES_MAX + 1),
+        bytes([BUNDLE]),
     ],
-    ids=["cut length", "too short a piece", "cut piece", "empty piece", "too long"],
+    ids=["cut length", "too short a piece", "cut piece", "empty piece", "too long", "nothing"],
 )
 def test_malformed_bundles_are_refused_whole(packet):
     assert is_bundle(packet)

@@ -9,7 +9,7 @@ from collections import ChainMap, UserDict, UserList, deque
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from cosmos_cli.onboard import log_tail
 from madns_runtime.config import Recording
 from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.lockstep.recorder import DirectWriter
 from madns_runtime.recording import run_journal, stream_file
 from madns_runtime.recording.reader import read_stream
 from madns_runtime.recording.record_files import RecordFiles
@@ -405,6 +406,32 @@ def test_written_records_make_room_in_the_buffer(tmp_path):
             wait_until(lambda n=number: recorder.counts().written > n)
 
     assert recorder.close(30).to_mapping()["written"] == 5000
+
+
+def test_writer_is_woken_before_the_smallest_buffer_is_full(tmp_path):
+    woken = []
+    writer = SimpleNamespace(start=lambda: None, flush=lambda: woken.append(1))
+    files = RecordFiles(tmp_path, run="0001-test", source="a")
+    recorder = Recorder(files, Recording(buffer_bytes=65_536), writer)
+    recorder.open_stream(PAIR)
+    while not woken:
+        recorder.record("pair", (1, 0.5))
+        assert recorder.counts().dropped == 0
+
+
+@pytest.mark.parametrize("text", ["short", "t" * 40_000, "t" * 65_000])
+def test_who_may_wait_for_the_disk_loses_nothing_that_the_buffer_holds(tmp_path, text):
+    said = StreamSchema("said", (Field("number", "", "int"), Field("text", "", "str")))
+    files = RecordFiles(tmp_path, run="0001-test", source="a")
+    recorder = Recorder(files, Recording(buffer_bytes=65_536), DirectWriter(files))
+    recorder.open_stream(said)
+    for number in range(2000 if text == "short" else 20):
+        recorder.record("said", (number, text))
+    counts = recorder.close(30)
+
+    numbers = [number for number, _ in read_lines(tmp_path / "said.jsonl")[1:-1]]
+    assert counts.dropped == 0
+    assert numbers == list(range(counts.written))
 
 
 def test_record_after_close_is_dropped(tmp_path):

@@ -142,6 +142,15 @@ def test_host_that_said_nothing_is_named():
     assert "without a result" in verdict.text
 
 
+def test_host_that_could_not_be_started_is_told_as_that():
+    problems = ("host cannot be started: Too many open files",)
+
+    verdict = judged(host_status=None, problems=problems)
+
+    assert verdict.text == "FAILED: host: cannot be started: Too many open files"
+    assert verdict.reason == "cannot be started: Too many open files"
+
+
 def test_every_broken_check_is_told_with_its_limit():
     verdict = judged(miss_ratio=0.01, rtf=1.5)
 

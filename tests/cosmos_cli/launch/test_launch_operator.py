@@ -498,6 +498,19 @@ def test_manual_agent_that_vanishes_is_told_to_the_host(launched: Launched) -> N
     assert outcome["host_result"]["reason"] == "agent-02: its hand-started process is gone"
 
 
+def test_manual_agent_for_whom_there_is_no_socket_ends_the_run_and_is_named(
+    launched: Launched,
+) -> None:
+    launched.start(
+        host={"runs_s": 60}, manual="agent-02", constants={"manual_seat.FOLDER_PREFIX": "no/such/"}
+    )
+
+    outcome = launched.outcome()
+
+    assert outcome["host_result"]["status"] == "failed"
+    assert "agent-02 cannot be started: no socket for it: " in outcome["host_result"]["reason"]
+
+
 def test_manual_agent_that_never_comes_does_not_keep_the_run_open(launched: Launched) -> None:
     launched.start(host={"runs_s": 1}, manual="agent-02")
 

@@ -221,6 +221,14 @@ MISTAKES = [
         "a.yaml:4:24: timeouts.shutdown_s: expected <= 315576000, got 1e10",
     ),
     (
+        "agents: {count: 3}\nnetwork: {receive_buffer_bytes: 2147483648}",
+        "a.yaml:4:33: network.receive_buffer_bytes: expected <= 2147483647, got 2147483648",
+    ),
+    (
+        "agents: {count: 3}\nrecording: {flush_interval_s: 1e-9}",
+        "a.yaml:4:31: recording.flush_interval_s: expected >= 0.001, got 1e-9",
+    ),
+    (
         "agents: {count: 3, tick_hz: .nan}",
         "a.yaml:3:29: agents.tick_hz: expected a finite number, got .nan",
     ),
