@@ -126,7 +126,7 @@ SCENARIO = """
 name: evil
 simulation: ./evil.py:simulation
 agents: {count: 2, tick_hz: 20}
-time: {duration_s: 1, rtf_tolerance: 1}
+time: {duration_s: 1, rtf_tolerance: 100}
 deadline: {max_miss_ratio: 1}
 """
 LONG = "time.duration_s=30"

@@ -19,7 +19,7 @@ SCENARIO = """
 name: survive
 simulation: constellation
 agents: {count: 3, tick_hz: 10}
-time: {mode: realtime, duration_s: 8, rtf_tolerance: 1}
+time: {mode: realtime, duration_s: 8, rtf_tolerance: 100}
 deadline: {max_miss_ratio: 1, overrun_ms: 2000}
 on_agent_loss: continue
 recording: {flush_interval_s: 0.05}

@@ -134,7 +134,7 @@ def test_run_tells_what_its_simulation_did_not_declare(tmp_path, mode):
     (tmp_path / "p.py").write_text(PLUGIN)
     (tmp_path / "a.yaml").write_text(
         "name: a\nsimulation: ./p.py:simulation\nagents: {count: 2}\n"
-        f"time: {{mode: {mode}, duration_s: 0.5, rtf_tolerance: 1}}\ndeadline: {{max_miss_ratio: 1}}\n"
+        f"time: {{mode: {mode}, duration_s: 0.5, rtf_tolerance: 100}}\ndeadline: {{max_miss_ratio: 1}}\n"
         "timeouts: {agents_ready_s: 60, silence_s: 30}\n"
     )
     command = [sys.executable, "-m", "cosmos_cli.app", "run", "a.yaml", "--json", "--no-report"]

@@ -16,7 +16,7 @@ SCENARIO = """
 name: timed
 simulation: counter
 agents: {count: 1, tick_hz: 10}
-time: {duration_s: 1, rtf_tolerance: 1}
+time: {duration_s: 1, rtf_tolerance: 100}
 deadline: {max_miss_ratio: 1}
 timeouts: {agents_ready_s: 120, silence_s: 30, complete_s: 60}
 """
