@@ -139,7 +139,7 @@ def test_flood_is_held_to_the_lines_rate_and_the_vehicle_flies_on(fly, frames):
     found = broken(document)
     assert found.pop("hardware.lost_bytes") == f"{TROUBLED}/mcu"
     assert {name: found[name] for name in set(found) - BUSY} == {ANSWERS_LATE: TROUBLED}, found
-    assert f"of {TROUBLED}/mcu" in document["verdict"]
+    assert f"worst: {TROUBLED}/mcu" in document["verdict"]
 
     device, interface = document["devices"][f"{TROUBLED}/mcu"], flight_of(document)["interface"]
     bound = BYTES_S * (FLOOD_S + 2) + ANSWER_BYTES_MAX * DURATION_S * HZ
