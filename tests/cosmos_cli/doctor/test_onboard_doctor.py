@@ -219,7 +219,8 @@ def deaf_once() -> Iterator[int]:
 
 @pytest.mark.process
 @pytest.mark.usefixtures("patient")
-def test_losses_are_counted(deaf_once: int) -> None:
+def test_losses_are_counted(deaf_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp_probe, "UNASKED_TIMEOUT_S", 0.0)  # nobody sends any
     told = udp_probe.round_trips("127.0.0.1", deaf_once, NONCE, 10)
 
     assert (told["sent"], told["answered"]) == (10, 9)
