@@ -561,7 +561,9 @@ def test_closed_pipe_is_no_error_to_talk_about():
     os.close(writer)
 
     assert process.stderr == b""
-    assert process.returncode == 141  # as README says, and as a shell tells of who is ended by SIGPIPE
+    assert (
+        process.returncode == 141
+    )  # as README says, and as a shell tells of who is ended by SIGPIPE
 
 
 @pytest.mark.process
