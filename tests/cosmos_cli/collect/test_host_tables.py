@@ -38,16 +38,20 @@ simulation = Simulation(name="p", parameters=Parameters, agent=":Agent", tabulat
 """
 
 
-def rows(folder, change="{}", agents=AGENTS):
-    (folder / "plug.py").write_text(PLUGIN.replace("CHANGE", change))
-    config = RunConfig(
+def config_of(folder, **more):
+    return RunConfig(
         run="0001-t",
         scenario="t",
         simulation="./plug.py:simulation",
         base_directory=str(folder),
         agents=Agents(count=2),
+        **more,
     )
-    return list(tabulated(RunDirectory(folder / "0001-t"), config, agents, TIMES_S))
+
+
+def rows(folder, change="{}", agents=AGENTS):
+    (folder / "plug.py").write_text(PLUGIN.replace("CHANGE", change))
+    return list(tabulated(RunDirectory(folder / "0001-t"), config_of(folder), agents, TIMES_S))
 
 
 @pytest.mark.parametrize(
@@ -134,14 +138,7 @@ def written(folder, change="{}", before="pass", told=lambda what, share: None):
     """Write the table as `cosmos tabulate` does; *before* is done for each agent, before its rows are yielded."""
     code = PLUGIN.replace("for agent in agents:\n", f"for agent in agents:\n        {before}\n")
     (folder / "plug.py").write_text("import os, signal, time\n" + code.replace("CHANGE", change))
-    config = RunConfig(
-        run="0001-t",
-        scenario="t",
-        simulation="./plug.py:simulation",
-        base_directory=str(folder),
-        agents=Agents(count=2),
-        timeouts=Timeouts(loading_s=2.0),
-    )
+    config = config_of(folder, timeouts=Timeouts(loading_s=2.0))
     layout = layout_with(NO_LABELS)
     wanted = Wanted(agents=AGENTS, times_s=TIMES_S, path=folder / "out.parquet", layout=layout)
     return write_host_table(RunDirectory(folder / "0001-t"), config, wanted, told)
