@@ -10,6 +10,7 @@ import numpy as np
 from cosmos_cli.evidence.completeness import ExpectedRecords
 from cosmos_cli.evidence.run_directory import RunDirectory, begin_run, create_run
 from madns_runtime.config import Agents, Recording, RunConfig, TimeSettings
+from madns_runtime.processes import ProcessEntry
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.records import (
@@ -200,6 +201,20 @@ class SyntheticRun:
         for path in (self.run.path / "agents" / agent).glob("*.jsonl"):
             first_line = len(path.read_bytes().split(b"\n")[0]) + 1
             self.cut(path, max(first_line, int(path.stat().st_size * share)))
+
+    def living_agent(self) -> ProcessEntry:
+        """Return the register's entry of a process of it that still lives."""
+        return ProcessEntry(
+            run=self.run.name,
+            role="agent",
+            name="agent-02",
+            pid=4242,
+            start_ticks=1,
+            boot_id="x",
+            node="n",
+            run_directory=str(self.run.path),
+            utc="",
+        )
 
 
 def _orbit_state(tick: int, t_s: float, index: int) -> tuple[float, ...]:

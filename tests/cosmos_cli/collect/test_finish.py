@@ -16,7 +16,6 @@ from cosmos_cli.errors import InputError, RunFailedError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import Problem
 from madns_runtime.config import Deadline
-from madns_runtime.processes import ProcessEntry
 from madns_runtime.recording.records import EVENTS, TICKS
 
 
@@ -282,17 +281,7 @@ def test_collecting_twice_gives_the_same_summary_and_the_same_package(tmp_path):
 
 def test_collect_refuses_while_a_process_of_the_run_lives(tmp_path):
     made = SyntheticRun(tmp_path).write()
-    living = ProcessEntry(
-        run=made.run.name,
-        role="agent",
-        name="agent-02",
-        pid=4242,
-        start_ticks=1,
-        boot_id="x",
-        node="n",
-        run_directory=str(made.run.path),
-        utc="",
-    )
+    living = made.living_agent()
 
     with pytest.raises(InputError, match=r"agent agent-02 \(pid 4242\)"):
         collect_run(made.run, processes=lambda: [living])

@@ -8,7 +8,6 @@ from harness.synthetic_run import SyntheticRun
 from cosmos_cli import app
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.evidence.run_documents import Problem
-from madns_runtime.processes import ProcessEntry
 
 
 @pytest.fixture(autouse=True)
@@ -160,17 +159,7 @@ def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
 def test_run_that_lives_is_to_be_waited_for_as_collecting_it_would_be_refused_too(
     made, capsys, monkeypatch, verb
 ):
-    living = ProcessEntry(
-        run=made.run.name,
-        role="agent",
-        name="agent-02",
-        pid=4242,
-        start_ticks=1,
-        boot_id="x",
-        node="n",
-        run_directory=str(made.run.path),
-        utc="",
-    )
+    living = made.living_agent()
     monkeypatch.setattr("cosmos_cli.collect.finished_run.list_processes", lambda: [living])
     monkeypatch.setattr("cosmos_cli.commands.judge.list_processes", lambda: [living])
 
