@@ -66,8 +66,10 @@ class Disk:
         if self.has_failed:  # as the boot scripts of a Pi would; 1 = errors corrected
             _run(["e2fsck", "-p", str(self.image)], accept=(0, 1))
             self.has_failed = False
-        options = "loop,errors=remount-ro,noatime,discard"
-        _mount_image(options, self.image, self.mount_point)
+        # Not `discard`: when its power is cut the kernel would give back blocks that a lost transaction had freed, with
+        # directories in them that are there again at the next mount.
+        _mount_image("loop,errors=remount-ro,noatime", self.image, self.mount_point)
+        kernel.trim(self.mount_point)
         self.loop = f"loop{os.minor(self.mount_point.stat().st_dev)}"
         for name in (UPPER, WORK):
             (self.mount_point / name).mkdir(exist_ok=True)

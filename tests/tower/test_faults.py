@@ -161,6 +161,19 @@ def test_power_cut_loses_what_was_not_synced(tower8):
     assert tower8.run("pi05", "cat synced").stdout == "a\n"
 
 
+def test_power_cut_brings_back_whole_what_was_deleted_and_not_synced(tower8):
+    boots = tower8.state()["boards"]["pi05"]["boots"]
+    tower8.run("pi05", "mkdir -p d/e && yes | head -c 100K > d/e/f && sync && rm -r d")
+
+    tower8.fault("pi05", "crash")
+    tower8.wait_until_on("pi05", boots + 1)
+
+    assert (
+        tower8.run("pi05", "yes | head -c 100K | cmp - d/e/f && touch d/e/g && echo whole").stdout
+        == "whole\n"
+    )
+
+
 def test_reboot_in_good_order_loses_nothing(tower8):
     boots = tower8.state()["boards"]["pi05"]["boots"]
     tower8.run("pi05", "echo b > unsynced; sudo reboot", check=False)
