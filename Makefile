@@ -24,6 +24,8 @@ linted: $(READY)
 
 # A line with $(MAKE) runs under `make -n`, too: pytest has one of its own. Tests call make, and this one's flags are not theirs.
 tested: $(READY)
+	@# Bytecode of the tests is written once here, and not by each of six workers.
+	@$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/.collected 2>&1 || cat $(VENV)/.collected
 	@$(MAKE) --no-print-directory measured
 	@$(MAKE) --no-print-directory unmeasured
 	MAKEFLAGS= $(VENV)/bin/python -m pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED))
