@@ -35,8 +35,23 @@ T = TypeVar("T")
 CONNECT_S = 20.0
 """For the scheduler to answer, and again for the workers: all within timeouts.host_start_s."""
 CONNECT_CHECK_S = 0.5
+CONNECT_ATTEMPTS = 8
+"""Of which one fails where the scheduler tells all its clients something at the moment at which it greets this one."""
 CLOSE_S = 3.0
 """For saying goodbye; after that connections are dropped, and processes of our own killed."""
+
+
+class ClosingClient(Client):  # type: ignore[misc]
+    """A client that leaves nothing behind if it does not come to be connected."""
+
+    def start(self, **more: Any) -> None:
+        """Connect, or close, which the collector of garbage did in whatever thread it ran, and waited there."""
+        try:
+            super().start(**more)
+        except BaseException:
+            with contextlib.suppress(Exception):
+                self.close(timeout=CLOSE_S)
+            raise
 
 
 class DaskExecutor(Executor):
@@ -174,7 +189,10 @@ def version_here() -> str:
 
 def _client(where: Any, address: str) -> Client:
     try:
-        return Client(where, timeout=CONNECT_S, set_as_default=False)
+        for _ in range(CONNECT_ATTEMPTS - 1):
+            with contextlib.suppress(AssertionError):  # of Dask, by which it knows the greeting
+                return ClosingClient(where, timeout=CONNECT_S, set_as_default=False)
+        return ClosingClient(where, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:  # a timeout is an OSError
         raise ConfigurationError(
             f"executor.address: expected a Dask scheduler at {address}, none answered in"

@@ -245,6 +245,31 @@ def test_what_answers_and_is_no_scheduler_is_told_as_such(words):
             make_executor(ExecutorSettings(kind="dask", address=address))
 
 
+class Talkative:
+    """A scheduler's plug-in: what goes to all clients comes to a new one with the scheduler's greeting, some times."""
+
+    name, times_left = "talkative", 3
+
+    def add_client(self, scheduler, client):
+        self.times_left -= 1
+        if self.times_left >= 0:
+            news = {"op": "cancelled-keys", "keys": ["x"], "reason": "none", "msg": ""}
+            scheduler.loop.asyncio_loop.call_soon(scheduler.report, news)
+
+
+def test_a_greeting_that_comes_with_news_for_all_clients_is_asked_for_again(cluster):
+    talkative = Talkative()
+    cluster.scheduler.plugins["talkative"] = talkative
+    try:
+        executor = connected(cluster)
+        assert executor.submit(math.sqrt, 4.0).result(PATIENCE_S) == 2.0
+        executor.shutdown()
+    finally:
+        del cluster.scheduler.plugins["talkative"]
+
+    assert talkative.times_left < 0
+
+
 def test_a_scheduler_without_workers_is_told_in_time(monkeypatch):
     # The scheduler is there, however long a busy machine takes to connect to it.
     client = functools.partial(distributed.Client, set_as_default=False)
