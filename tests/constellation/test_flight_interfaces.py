@@ -470,11 +470,18 @@ def test_what_cannot_be_ends_the_agent_with_blame(tmp_path):
         136, 0.0, bytes(8)
     )
     flight = attached({"kind": "stdio"})
-    flight["command"] = [
-        sys.executable,
-        "-c",
-        f"import os, time; os.read(0, 9); os.write(1, {told!r}); time.sleep(60)",
-    ]
+    program = tmp_path / "program.py"
+    program.write_text(f"""
+import os, sys, time
+sys.path.insert(0, {str(Path(guided_program.__file__).parent)!r})
+from guided_program import Frames
+frames = Frames(None)
+while 7 not in [number for number, *_ in frames.cut(os.read(0, 65536))]:  # the end of what a tick reports
+    pass
+os.write(1, {told!r})
+time.sleep(60)
+""")
+    flight["command"] = [sys.executable, str(program)]
     ship = Ship(tmp_path, None, flight=flight)
 
     with pytest.raises(BlamedError, match=r"one of inertial, rtn, body, got 'number 7'"):
