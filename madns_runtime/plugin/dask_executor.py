@@ -41,7 +41,7 @@ CLOSE_S = 3.0
 """For saying goodbye; after that connections are dropped, and processes of our own killed."""
 
 
-class ClosingClient(Client):  # type: ignore[misc]
+class ClosingClient(Client):  # type: ignore[misc]  # distributed has no types
     """A client that leaves nothing behind if it does not come to be connected."""
 
     def start(self, **more: Any) -> None:
