@@ -44,7 +44,7 @@ def test_sixty_seconds_serve_every_tick_with_the_propagators_own_states(kind):
     for number, name in enumerate(star.agents):
         rows = state_rows(star, name)
         assert rows[:, 0].tolist() == list(range(600))
-        # Records are rounded to 1 um and 1 nm/s; SGP4's positions carry noise of 1e-5 m.
+        # Records are rounded to 10 um and 10 nm/s; SGP4's positions carry noise of 1e-5 m.
         noise_m_s = 3e-5 if kind == "sgp4" else 0.0
         assert np.abs(rows[:, 1:4] - truth[number, :, :3]).max() < 0.7e-4
         assert np.abs(rows[:, 4:] - truth[number, :, 3:]).max() < 1.3e-7 + noise_m_s

@@ -2,8 +2,8 @@
 An agent's half of the constellation: one vehicle with its truth, its sensors and its flight software.
 
 Needs numpy and nothing of the host's side. A tick costs about 3 us besides recording, 8 us with
-elements; their streams round them, to 1 um and 1 nm/s, which keeps a tick's records near 103 B at 10 Hz: what is flown on
-from a record, in LEO, is 0.3 mm off after a day. The host's own record has every bit.
+elements; their streams round them, to 10 um and 10 nm/s, which keeps a tick's records near 97 B at 10 Hz: what is flown on
+from a record, in LEO, is 2 mm off after a day. The host's own record has every bit.
 """
 
 from __future__ import annotations

@@ -23,12 +23,12 @@ LINK_OUTCOMES = (
 
 STATE = (
     Field("tick", "", "int"),
-    Field("x_teme_m", "m", digits=6),
-    Field("y_teme_m", "m", digits=6),
-    Field("z_teme_m", "m", digits=6),
-    Field("vx_teme_m_s", "m/s", digits=9),
-    Field("vy_teme_m_s", "m/s", digits=9),
-    Field("vz_teme_m_s", "m/s", digits=9),
+    Field("x_teme_m", "m", digits=5),
+    Field("y_teme_m", "m", digits=5),
+    Field("z_teme_m", "m", digits=5),
+    Field("vx_teme_m_s", "m/s", digits=8),
+    Field("vy_teme_m_s", "m/s", digits=8),
+    Field("vz_teme_m_s", "m/s", digits=8),
 )
 """Truth at every tick, or as often as the scenario says; a tick without truth has no record."""
 
