@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from harness.synthetic_run import MACHINE, SyntheticRun, make_config
@@ -511,6 +512,15 @@ def test_readers_of_tables_take_labels_for_no_recorded_field(tmp_path):
 
     assert [field.name for field in table.fields][:3] == ["t_s", "tick", "x_m"]
     assert table.has("satellite", "simulated_utc")
+
+
+@pytest.mark.parametrize("about", [None, {b"cosmos": b"[1]"}, {b"cosmos": b"{}"}])
+def test_parquet_file_of_somebody_else_is_no_table(tmp_path, about):
+    pq.write_table(
+        pa.table({"a": [1.0]}).replace_schema_metadata(about), tmp_path / "mine.parquet"
+    )
+
+    assert open_tables(tmp_path) == {}
 
 
 def test_times_without_a_utc_are_null(tmp_path):
