@@ -69,6 +69,18 @@ def test_runs_lists_what_was_run(made, capsys):
     assert (second["run"], second["status"]) == ("0002-synthetic", "cut off")
 
 
+@pytest.mark.parametrize(
+    ("status", "shown"), [("complete", "20 s "), ("interrupted", "20 s planned")]
+)
+def test_runs_tell_a_planned_duration_from_one_that_was_simulated(made, capsys, status, shown):
+    finish_run(made.run, made.result(status=status), made.expected, has_report=False)
+
+    assert app.run(["runs"]) == 0
+
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if "0001-synthetic" in x]
+    assert f"  {shown}" in line
+
+
 def test_run_that_went_on_without_its_operator_is_not_called_cut_off(made, capsys):
     plan = made.run.read_json(made.run.plan_json)
     made.run.plan_json.write_text(json.dumps(plan | {"is_detached": True}))
@@ -218,6 +230,20 @@ def test_pipe_among_the_tables_is_named_and_not_waited_for(made, capsys):
     assert app.run(["diff", "1", "1"]) == 0
     assert "links or no files: tables/pipe.parquet" in capsys.readouterr().out
     assert app.run(["collect", "1"]) == 0
+
+
+@pytest.mark.parametrize("arguments", [["report", "1"], ["diff", "1", "1"]])
+def test_table_that_no_collection_made_is_not_read_for_the_run(made, capsys, arguments):
+    finish(made)
+    (made.run.tables / "foreign.parquet").write_bytes(
+        (made.run.tables / "round_trips.parquet").read_bytes()
+    )
+
+    assert app.run(arguments) == 2
+    assert "foreign.parquet: no collection made it" in capsys.readouterr().err
+
+    made.run.manifest_json.unlink()  # nobody knows what was collected
+    assert app.run(arguments) == 0
 
 
 @pytest.mark.slow
