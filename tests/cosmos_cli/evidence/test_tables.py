@@ -494,6 +494,23 @@ def test_time_zero_is_the_epoch_of_summary_or_parameters_whatever_the_simulation
     assert TableLabels.of(nothing, {**result, "simulation": {}}).zero_utc is None
 
 
+@pytest.mark.parametrize("is_told_by_the_host", [True, False])
+def test_time_zero_that_is_no_time_is_remarked_on_as_tables_have_no_utc(
+    tmp_path, is_told_by_the_host
+):
+    given = {"epoch_utc": "noon\x1b"}
+    config = make_config(parameters={} if is_told_by_the_host else given)
+    made = SyntheticRun(tmp_path, config).write()
+    result = made.result(simulation=given if is_told_by_the_host else {})
+
+    finish_run(made.run, result, made.expected, has_report=False)
+
+    assert (
+        "tables have no simulated_utc: expected an epoch_utc such as 2017-03-07T12:00:00Z, got 'noon\\x1b'"
+        in made.run.read_json(made.run.run_json)["remarks"]
+    )
+
+
 def test_nothing_is_labelled_where_time_zero_is_not_known(tmp_path):
     made = SyntheticRun(tmp_path).write(with_states=True)
     finish_run(made.run, None, made.expected, has_report=False)
@@ -516,9 +533,7 @@ def test_readers_of_tables_take_labels_for_no_recorded_field(tmp_path):
 
 @pytest.mark.parametrize("about", [None, {b"cosmos": b"[1]"}, {b"cosmos": b"{}"}])
 def test_parquet_file_of_somebody_else_is_no_table(tmp_path, about):
-    pq.write_table(
-        pa.table({"a": [1.0]}).replace_schema_metadata(about), tmp_path / "mine.parquet"
-    )
+    pq.write_table(pa.table({"a": [1.0]}).replace_schema_metadata(about), tmp_path / "mine.parquet")
 
     assert open_tables(tmp_path) == {}
 
