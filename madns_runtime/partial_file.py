@@ -23,7 +23,7 @@ MODE = 0o666
 """By the umask, as of any file."""
 
 
-def create_partial(path: Path, *, takes_over: bool = False) -> tuple[Path, int]:
+def create_partial(path: Path, *, takes_over: bool) -> tuple[Path, int]:
     """
     Create a file beside *path* that nobody else has.
 

@@ -91,8 +91,8 @@ def calibrate(
     sensor: SensorName,
     folders: Sequence[Path],
     *,
-    channel: str | None = None,
-    field_t: float | None = None,
+    channel: str | None,
+    field_t: float | None,
     limits: tuple[float, float] | None = None,
 ) -> SensorCalibration:
     """

@@ -90,7 +90,7 @@ class PluginAnswers:
 
 
 def ask_plugin(
-    document: Document, agents: Agents | None, base_directory: Path, *, duration_s: float = 0.0
+    document: Document, agents: Agents | None, base_directory: Path, *, duration_s: float
 ) -> PluginAnswers:
     """
     Return what the simulation that a scenario names says to its parameters.
