@@ -16,12 +16,8 @@ COLUMNS_OF_TABLES: Final = ("agent", "agent_name", "host", "incarnation", "t_s",
 """Columns that tables add to records: second names need one of their own."""
 
 
-def descriptor_faults(descriptor: Any) -> list[str]:
-    """Return a fault per field that is not what it must be, but for those that name parts."""
-    return [*_faults(descriptor)]
-
-
-def _faults(descriptor: Any) -> Iterator[str]:
+def descriptor_faults(descriptor: Any) -> Iterator[str]:
+    """Yield a fault per field that is not what it must be, but for those that name parts."""
     parameters = descriptor.parameters
     if not (isinstance(parameters, type) and dataclasses.is_dataclass(parameters)):
         yield "parameters: expected a dataclass (the class itself)"
