@@ -9,11 +9,7 @@ from cosmos_cli import app
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.evidence.run_documents import Problem
 
-
-@pytest.fixture(autouse=True)
-def own_register(tmp_path, monkeypatch):
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+pytestmark = pytest.mark.usefixtures("own_places")
 
 
 @pytest.fixture
