@@ -19,15 +19,16 @@ SUFFIX = ".part"
 RANDOM_BYTES = 6
 TRIES_MAX = 16
 FLAGS = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+MODE = 0o666
+"""By the umask, as of any file."""
 
 
-def create_partial(path: Path, *, mode: int = 0o666, takes_over: bool = False) -> tuple[Path, int]:
+def create_partial(path: Path, *, takes_over: bool) -> tuple[Path, int]:
     """
     Create a file beside *path* that nobody else has.
 
     Args:
         path: What it will be.
-        mode: As for `os.open`.
         takes_over: Whether what a killed writer left is removed first, because it may be large. For
             files of which there is one writer at a time.
 
@@ -41,13 +42,13 @@ def create_partial(path: Path, *, mode: int = 0o666, takes_over: bool = False) -
     if takes_over:
         remove_partial(path)
         with contextlib.suppress(FileExistsError):
-            return plain, os.open(plain, FLAGS, mode)
+            return plain, os.open(plain, FLAGS, MODE)
     for _ in range(TRIES_MAX - 1):
         partial = _random_name(path)
         with contextlib.suppress(FileExistsError):
-            return partial, os.open(partial, FLAGS, mode)
+            return partial, os.open(partial, FLAGS, MODE)
     partial = _random_name(path)
-    return partial, os.open(partial, FLAGS, mode)
+    return partial, os.open(partial, FLAGS, MODE)
 
 
 def remove_partial(path: Path) -> None:

@@ -205,6 +205,11 @@ def is_whole(value: object) -> TypeGuard[int]:
     return issubclass(type(value), Integral) and type(value) is not bool
 
 
+def are_texts(values: object) -> bool:
+    """Tell whether a value is a list or a tuple of texts alone."""
+    return isinstance(values, tuple | list) and all(isinstance(text, str) for text in values)
+
+
 class OwnCopies:
     """Makes copies of values for many owners: what can be changed is each one's own, what cannot be is shared by all."""
 

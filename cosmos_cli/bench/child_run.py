@@ -51,7 +51,7 @@ def run_arguments(
     inventory: Sequence[str] | None,
     limit: str | None,
     host: str | None,
-    settings: Sequence[str] = (),
+    settings: Sequence[str],
 ) -> list[str]:
     """Return options of a command as arguments of the `cosmos run` that it starts."""
     arguments = [word for each in inventory or () for word in ("--inventory", each)]

@@ -69,7 +69,7 @@ def measure_floor(
     *,
     responder: Responder | None = None,
     machine: Machine | None = None,
-    say: Callable[[str], None] = lambda text: None,
+    say: Callable[[str], None],
 ) -> list[Told]:
     """
     Measure one machine.

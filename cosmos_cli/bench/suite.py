@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -174,7 +174,6 @@ def run_suite(
     options: Sequence[str],
     runs: Path,
     console: Console,
-    run: Callable[..., ChildRunOutcome] = run_child,
 ) -> list[SuiteRun]:
     """
     Run scenarios one after the other, those of the shortest time first, and print each one's table.
@@ -184,7 +183,6 @@ def run_suite(
         options: Further arguments of `cosmos run`: inventory, settings.
         runs: Folder of all runs.
         console: Where tables and talk go.
-        run: As `run_child`.
 
     Returns:
         The runs that were made; an interrupted one is the last.
@@ -195,7 +193,7 @@ def run_suite(
         duration_s = scenario.scenario.time.duration_s
         console.say(f"{number} of {len(ordered)}: {scenario.path}, {duration_s:g} s")
         longest_s = scenario.run_config("bench").longest_s
-        outcome = run(
+        outcome = run_child(
             [str(scenario.path), "--runs", str(runs), *options],
             limit_s=longest_s + 600.0 + COLLECT_SHARE * duration_s,
             is_quiet=console.quiet,

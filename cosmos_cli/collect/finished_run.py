@@ -13,6 +13,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.onboard.processes import words_of
 from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
+from madns_runtime.plain_values import mapping_at
 from madns_runtime.processes import ProcessEntry, list_processes
 
 PROCESSES_SHOWN_MAX = 3
@@ -37,6 +38,23 @@ def collected_document(run: RunDirectory, given: str) -> dict[str, Any]:
             f"{run.name} is not collected yet; do that with: cosmos collect {shlex.quote(given)}"
         )
     return document
+
+
+def refuse_foreign_tables(run: RunDirectory) -> None:
+    """
+    See that the manifest lists every table that would be read; without a manifest nobody knows.
+
+    Raises:
+        InputError: It does not list one.
+    """
+    listed = mapping_at(run.read_json(run.manifest_json), "files")
+    for path in sorted(run.tables.glob("*.parquet")) if listed else ():
+        is_read = path.is_file() and not path.is_symlink()
+        if is_read and f"{run.tables.name}/{path.name}" not in listed:
+            raise InputError(
+                f"{path}: no collection made it, and its values would pass for the run's; remove it, or have it noted"
+                f" with: cosmos collect {run.shell_path}"
+            )
 
 
 def refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None:

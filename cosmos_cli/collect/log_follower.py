@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
@@ -55,7 +54,6 @@ class LogFollower:
         reading: What is wanted, and how far each file was read.
         options: How machines are connected to.
         on_failure: Called once for each machine that cannot be asked.
-        now_s: A monotonic clock.
     """
 
     run: RunDirectory
@@ -63,7 +61,6 @@ class LogFollower:
     reading: LogReading
     options: ConnectOptions
     on_failure: Callable[[str, MachineFailure], None]
-    now_s: Callable[[], float] = time.monotonic
     failed: set[str] = field(default_factory=set)
     """Machines whose log is not read, or not all of it."""
     _living: dict[str, bool] = field(default_factory=dict)

@@ -61,7 +61,7 @@ class Earlier:
         paths = [PurePosixPath(name).parts for name in self.entries]
         return tuple(dict.fromkeys(p[1] for p in paths if len(p) > 2 and p[0] == folder))
 
-    def changed_files(self, run: RunDirectory, unread: Container[Path] = ()) -> dict[str, str]:
+    def changed_files(self, run: RunDirectory, unread: Container[Path]) -> dict[str, str]:
         """Return what happened to each file that is no stream and is not what it was, by name; *unread* are left out."""
         return self._changed(
             {
@@ -72,7 +72,7 @@ class Earlier:
         )
 
     def changed_streams(
-        self, run: RunDirectory, scans: Mapping[Path, StreamScan], unread: Container[Path] = ()
+        self, run: RunDirectory, scans: Mapping[Path, StreamScan], unread: Container[Path]
     ) -> dict[str, str]:
         """Return what happened to each stream that is not what it was, by the name of its file; *unread* are left out."""
         paths = {name: run.path / name for name in self.entries if name.endswith(SUFFIX)}

@@ -9,7 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.collect.finished_run import collected_document, refuse_living
+from cosmos_cli.collect.finished_run import (
+    collected_document,
+    refuse_foreign_tables,
+    refuse_living,
+)
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.expectations.judge import JudgedExpectations
@@ -118,12 +122,7 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
         what = f"{run.path / cut[0]}" + (f" and {len(cut) - 1} more" if cut[1:] else "")
         text = "missing, or not as it was collected"
         raise InputError(f"{what}: {text}; make it anew with: cosmos collect {run.shell_path}")
-    for path in sorted(run.tables.glob("*.parquet")):
-        if f"{run.tables.name}/{path.name}" not in tables:
-            text = "no collection made it, and its values would be judged as the run's"
-            raise InputError(
-                f"{path}: {text}; remove it, or have it noted with: cosmos collect {run.shell_path}"
-            )
+    refuse_foreign_tables(run)
     return document
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.collect.finished_run import collected_document
+from cosmos_cli.collect.finished_run import collected_document, refuse_foreign_tables
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import runs_root
@@ -34,6 +34,7 @@ def report(
     console = Console(json=as_json, quiet=quiet)
     found = find_run(runs_root(folder), run)
     document = collected_document(found, run)
+    refuse_foreign_tables(found)
     fault = fault_of_summary(document)
     if fault is not None:
         raise InputError(

@@ -66,7 +66,8 @@ def _entry(run: RunDirectory, *, is_living: bool) -> dict[str, Any]:
 
 
 def _row(entry: dict[str, Any]) -> list[str]:
-    duration_s = entry["duration_s"]
+    # The key tells what was to be run: one that was cut short has not come so far.
+    duration_s, is_flown = entry["duration_s"], entry["status"] == "complete"
     verdict = entry["verdict"] or ""
     if len(verdict) > VERDICT_CHARACTERS_MAX:
         verdict = verdict[: VERDICT_CHARACTERS_MAX - 3] + "..."
@@ -75,7 +76,7 @@ def _row(entry: dict[str, Any]) -> list[str]:
         entry["status"],
         _shown(entry["exit_code"]),
         _shown(entry["agents"]),
-        "-" if duration_s is None else f"{duration_s:g} s",
+        "-" if duration_s is None else f"{duration_s:g} s{'' if is_flown else ' planned'}",
         _shown(entry["started_utc"])[:19].replace("T", " "),
         verdict,
     ]

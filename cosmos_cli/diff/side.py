@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from cosmos_cli.collect.finished_run import collected_document
+from cosmos_cli.collect.finished_run import collected_document, refuse_foreign_tables
 from cosmos_cli.collect.previous_manifest import Earlier, is_there
 from cosmos_cli.diff.recorded import Key, Recorded, recorded_streams
 from cosmos_cli.errors import InputError
@@ -83,9 +83,10 @@ def open_side(run: RunDirectory, given: str) -> Side:
         given: What a person called it, for advice.
 
     Raises:
-        InputError: It is not collected yet, or what it ran is not known any more.
+        InputError: It is not collected yet, has a table that it did not make, or what it ran is not known any more.
     """
     document = collected_document(run, given)
+    refuse_foreign_tables(run)
     config = run.read_config()
     # By way of the class, which knows the old names of keys.
     settings = to_mapping(config) if config else (run.read_json(run.plan_json) or {}).get("config")

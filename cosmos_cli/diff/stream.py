@@ -145,7 +145,7 @@ def diff_stream(
     b: Recorded,
     pairing: Pairing,
     *,
-    agents: Sequence[str] = (),
+    agents: Sequence[str],
 ) -> StreamDifference:
     """
     Compare one stream of one source, in bounded memory.

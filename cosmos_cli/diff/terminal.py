@@ -9,6 +9,7 @@ from cosmos_cli.diff.fields import RecordPlace
 from cosmos_cli.diff.stream import Alone, By, StreamDifference
 from cosmos_cli.report.cells import format_cell
 from cosmos_cli.ui.console import Column, Console
+from cosmos_cli.ui.name_ranges import names_by
 from cosmos_cli.ui.plural import counted
 from madns_runtime.analysis.values import ReportRemark, SimulationDifference, TableBlock
 
@@ -120,7 +121,7 @@ def _print_streams(console: Console, found: Comparison) -> None:
     for line in (*_text_lines(found, totals), *_alone_lines(totals)):
         console.data(line)
     for name, keys in (("A", found.only_a), ("B", found.only_b)):
-        for table, sources in _by_table(keys).items():
+        for table, sources in names_by(keys).items():
             console.data(f"only in {name}: {table} of {_listed(sources)}")
 
 
@@ -190,13 +191,6 @@ def _told_alone(alone: Alone, by: By) -> str:
     if alone.count == 1:
         return f"1 record ({first})"
     return f"{alone.count} records ({first} to {last})"
-
-
-def _by_table(keys: Sequence[tuple[str, str]]) -> dict[str, list[str]]:
-    tables: dict[str, list[str]] = {}
-    for table, source in keys:
-        tables.setdefault(table, []).append(source)
-    return tables
 
 
 def _listed(names: Sequence[str]) -> str:

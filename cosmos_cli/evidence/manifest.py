@@ -63,9 +63,9 @@ def _below(folder: Path) -> Iterator[tuple[Path, OSError | None]]:
 def build_manifest(
     run: RunDirectory,
     scans: Mapping[Path, StreamScan],
-    was: Mapping[str, Mapping[str, Any]] | None = None,
+    was: Mapping[str, Mapping[str, Any]] | None,
     *,
-    without: Container[Path] = (),
+    without: Container[Path],
 ) -> dict[str, Any]:
     """
     Return the manifest of all files but itself.

@@ -27,6 +27,7 @@ from cosmos_cli.evidence.run_directory import SCHEMA
 from cosmos_cli.evidence.run_documents import Problem, text_or_none
 from cosmos_cli.evidence.statistics import TickStatistics, TickTotals, tick_totals, worst_sources
 from cosmos_cli.evidence.streams import StreamScan
+from cosmos_cli.evidence.table_labels import time_zero_remarks
 from cosmos_cli.evidence.tick_causes import AgentCauses, CauseTotals, cause_totals, told_causes
 from cosmos_cli.evidence.verdict import (
     CheckLimits,
@@ -178,6 +179,7 @@ class Evidence:
             remarks=(
                 *(causes.remarks(self._lateness_limit_s()) if causes else ()),
                 *result_remarks(result, self._summaries()),
+                *time_zero_remarks(self.config, result),
                 *device_remarks(mapping_at(result, "agents"), self.devices),
                 *datagram_remarks(datagram_account(result)),
                 *undeclared_remarks(self.declared, self.scans),

@@ -181,18 +181,13 @@ def open_stream_file(path: Path, role: Role, runs: Collection[str] = ()) -> Reco
     )
 
 
-def scan_stream(
-    file: RecordFile,
-    consume: Consumer | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> StreamScan:
+def scan_stream(file: RecordFile, consume: Consumer | None = None) -> StreamScan:
     """
     Read a whole stream, once: hashed, counted, and given to *consume*.
 
     Args:
         file: The stream.
         consume: Called with each batch of records.
-        progress: Called with the records read since its last call.
 
     Raises:
         MachineError: The file cannot be read.
@@ -204,8 +199,6 @@ def scan_stream(
             for columns, count in read_batches(file, reading):
                 if consume is not None:
                     consume(columns, count)
-                if progress is not None:
-                    progress(count)
         state = reading.state
     except OSError as error:
         raise MachineError(f"{file.path}: cannot be read: {error.strerror}") from error

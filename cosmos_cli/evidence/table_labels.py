@@ -54,15 +54,8 @@ class TableLabels:
             result: What the host reported at its end; None if it could not.
             plan: Its plan.json.
         """
-        result, agents = result or {}, agent_labels(plan, result)
-        places = (mapping_at(result, "simulation"), config.parameters if config else {})
-        if epochs := [place[EPOCH] for place in places if EPOCH in place]:
-            zero_utc = next(filter(None, epochs), None)
-        elif config is not None and config.time.is_lockstep:
-            zero_utc = LOCKSTEP_ZERO_UTC
-        else:
-            zero_utc = result.get("t0_utc")
-        return cls(zero_utc=_parse_utc(zero_utc), agents=agents)
+        zero_utc = _parse_utc(_told_zero(config, result or {}))
+        return cls(zero_utc=zero_utc, agents=agent_labels(plan, result))
 
     def utc_us(self, t_s: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return microseconds since 1970 UTC at simulated times, shape (N,), s; NEVER_US where there is no time."""
@@ -97,6 +90,24 @@ def agent_labels(plan: Mapping[str, Any] | None, result: Mapping[str, Any] | Non
 def run_labels(run: RunDirectory) -> AgentLabels:
     """Return the second names of a run's agents, whatever its simulation is now."""
     return agent_labels(run.read_json(run.plan_json), run.read_json(run.result_json))
+
+
+def time_zero_remarks(config: RunConfig | None, result: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a remark where simulated time zero is told, and is no time that tables could tell."""
+    told = _told_zero(config, result)
+    if told is None or _parse_utc(told) is not None:
+        return ()
+    expected = f"expected an {EPOCH} such as 2017-03-07T12:00:00Z, got {told!r:.80}"
+    return (f"tables have no simulated_utc: {expected}",)
+
+
+def _told_zero(config: RunConfig | None, result: Mapping[str, Any]) -> object:
+    places = (mapping_at(result, "simulation"), config.parameters if config else {})
+    if epochs := [place[EPOCH] for place in places if EPOCH in place]:
+        return next(filter(None, epochs), None)
+    if config is not None and config.time.is_lockstep:
+        return LOCKSTEP_ZERO_UTC
+    return result.get("t0_utc")
 
 
 def _parse_utc(text: object) -> datetime | None:

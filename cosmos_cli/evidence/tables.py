@@ -238,7 +238,7 @@ class TableReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = pq.ParquetFile(path, page_checksum_verification=True)
-        note = json.loads(self._file.schema_arrow.metadata[METADATA_KEY])
+        note = json.loads((self._file.schema_arrow.metadata or {})[METADATA_KEY])
         self.name: str = note["table"]
         self.role: str = note["role"]
         self._source_column: str = note["source_column"]
@@ -330,7 +330,7 @@ def open_tables(folder: Path) -> dict[str, TableReader]:
     """Return the tables of a run by name; one that cannot be read is left out, as is what is no file."""
     tables: dict[str, TableReader] = {}
     for path in sorted(folder.glob("*.parquet")):
-        with contextlib.suppress(OSError, pa.ArrowException, KeyError, ValueError):
+        with contextlib.suppress(OSError, pa.ArrowException, KeyError, TypeError, ValueError):
             if _is_file(path):
                 tables[path.stem] = TableReader(path)
     return tables

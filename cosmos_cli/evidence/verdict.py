@@ -17,11 +17,6 @@ from cosmos_cli.ui.plural import counted
 from madns_runtime.conditions.reports import BROKEN
 from madns_runtime.plain_values import mapping_at
 
-ORDER = (
-    "interrupted 130, ended by a lost machine 3, failed 1, a machine failed 3, data incomplete 5,"
-    " a check broken 4, not clean 3"
-)
-"""Order of endings: of several that are true the first is told. README and docs/fleet.md hold the same words."""
 OF_TICKS = "deadline."
 """Begins the names of the checks that late and missed ticks break."""
 TICKS_OF_A_RATE = 2

@@ -59,9 +59,7 @@ class DatagramServer:
                     self._answer(self._socket, *self._socket.recvfrom(DATAGRAM_BYTES_MAX))
 
 
-def bound_socket(
-    address: str = "", port: int = 0, *, family: int = socket.AF_INET6
-) -> socket.socket:
+def bound_socket(address: str = "", port: int = 0, *, family: int) -> socket.socket:
     """
     Return a UDP socket; without an address, one of IPv6 is on all addresses of both families.
 

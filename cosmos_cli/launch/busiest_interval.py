@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 POINTS_MAX = 4096
 """Interval lengths that are looked at; beyond, a bound stands for what a longer one could hold."""
@@ -72,7 +73,9 @@ def busiest_interval(sendings: Sequence[Sending], agents: float) -> BusiestInter
             break
         if count >= POINTS_MAX:
             bound = mean + excess / length_s
-            best = max(best, BusiestInterval(length_s=length_s, bytes_s=bound), key=_load)
+            best = max(
+                best, BusiestInterval(length_s=length_s, bytes_s=bound), key=attrgetter("bytes_s")
+            )
             break
         carried = sum(e.senders(agents) * e.wire_bytes * e.messages(length_s) for e in sendings)
         here = BusiestInterval(length_s=length_s, bytes_s=carried / length_s)
@@ -87,10 +90,6 @@ def _excess_bytes(sending: Sending, agents: float) -> float:
     if abs(share) < ROUNDING:
         return 0.0
     return sending.senders(agents) * sending.wire_bytes * share
-
-
-def _load(interval: BusiestInterval) -> float:
-    return interval.bytes_s
 
 
 def _lengths(sendings: Sequence[Sending]) -> Iterator[float]:

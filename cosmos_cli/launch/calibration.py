@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.launch.feasibility import finite
 from cosmos_cli.models.device_kinds import DeviceQuestion, ask_kinds
 from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import ConfigurationError, MissingExtraError
@@ -91,8 +92,8 @@ def calibrate(
     sensor: SensorName,
     folders: Sequence[Path],
     *,
-    channel: str | None = None,
-    field_t: float | None = None,
+    channel: str | None,
+    field_t: float | None,
     limits: tuple[float, float] | None = None,
 ) -> SensorCalibration:
     """
@@ -167,9 +168,5 @@ def to_document(found: SensorCalibration) -> dict[str, Any]:
     told = dataclasses.asdict(found)
     for key in ("bias", "scale"):
         if told[key] is not None:
-            told[key] = {name: [_plain(n) for n in numbers] for name, numbers in told[key].items()}
+            told[key] = {name: [finite(n) for n in numbers] for name, numbers in told[key].items()}
     return {**told, "settings": found.settings()}
-
-
-def _plain(number: float) -> float | None:
-    return number if math.isfinite(number) else None

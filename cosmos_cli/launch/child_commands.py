@@ -13,7 +13,7 @@ Command = Mapping[str, Any]
 STOP: Command = {"command": "stop", "reason": "the run is over"}
 
 
-def stop_host(status: str, why: str, who: str = "operator") -> Command:
+def stop_host(status: str, why: str, who: str) -> Command:
     """Return the order to end the run with *status*, for what *who* did."""
     order = {"command": "stop", "reason": why, "status": status}
     return order if who == "operator" else {**order, "who": who}

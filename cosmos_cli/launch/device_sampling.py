@@ -112,7 +112,7 @@ def sample_here(
     directory: Path,
     *,
     writes: bool = False,
-    say: Callable[[str], None] = lambda text: None,
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """
     Drive devices of this computer for some seconds, and return what each gave, by full name.

@@ -30,7 +30,7 @@ def hardware_faults(
     base_directory: Path,
     *,
     labels: AgentLabels | None,
-    uses: Sequence[DeviceUse] = (),
+    uses: Sequence[DeviceUse],
 ) -> tuple[list[Fault], tuple[KnownDevice, ...]]:
     """
     Return what is wrong with a scenario's section `hardware`, and the devices whose streams rules may name.

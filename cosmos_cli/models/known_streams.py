@@ -184,7 +184,7 @@ class KnownStreams:
         return f"stream {stream} has no field {name!r}{did_you_mean(name, known)}"
 
     def word_fault(
-        self, stream: str, field: str, word: object, sources: Collection[str] = ()
+        self, stream: str, field: str, word: object, sources: Collection[str]
     ) -> str | None:
         """
         Return what is wrong with a text that is waited for in a field; None if it may come.

@@ -58,7 +58,7 @@ def select_machines(
 
 
 def matching_machines(
-    machines: Sequence[Machine], pattern: str, *, groups: Sequence[str] = ()
+    machines: Sequence[Machine], pattern: str, *, groups: Sequence[str]
 ) -> tuple[Machine, ...]:
     """
     Return the machines that *pattern* means, for a caller who tells where it was written.

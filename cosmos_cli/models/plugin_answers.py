@@ -38,7 +38,7 @@ from madns_runtime.config import Agents, to_mapping
 from madns_runtime.errors import ConfigurationError, MadnsError, PluginError
 from madns_runtime.plugin.api import DeclaredStream, DeviceUse, PlaceUse, Simulation
 from madns_runtime.plugin.code_places import blame, place_of
-from madns_runtime.plugin.columns import unknown_columns
+from madns_runtime.plugin.columns import label_column_remarks, unknown_columns
 from madns_runtime.plugin.isolation import is_interruption, said
 from madns_runtime.plugin.queries import (
     ask_check,
@@ -90,7 +90,7 @@ class PluginAnswers:
 
 
 def ask_plugin(
-    document: Document, agents: Agents | None, base_directory: Path, *, duration_s: float = 0.0
+    document: Document, agents: Agents | None, base_directory: Path, *, duration_s: float
 ) -> PluginAnswers:
     """
     Return what the simulation that a scenario names says to its parameters.
@@ -155,6 +155,9 @@ class _Asking:
             found = replace(found, labels=self._labels(simulation, parameters, self._agents))
             rules = self._rules(simulation, self._agents, found, duration_s)
             found = replace(found, **of_all_agents(own, rules))
+            if simulation.labels is not None:
+                taken = label_column_remarks(simulation.label_column, found.streams or ())
+                self._remarks += [self._document.fault(("simulation",), text) for text in taken]
             self._check_actions(simulation, parameters, own_actions, found.labels)
         return self._told(found)
 

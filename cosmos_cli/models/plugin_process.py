@@ -18,6 +18,7 @@ from cosmos_cli.models.separate_process import SeparateDefect, work_separately
 from madns_runtime import errors as runtime_errors
 from madns_runtime.config import Timeouts, from_mapping, to_mapping
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
+from madns_runtime.plain_values import is_real
 from madns_runtime.plugin.queries import import_questions
 from madns_runtime.plugin.registry import is_shipped, resolve
 
@@ -68,7 +69,7 @@ def _limit_s(document: Document) -> float:
     """Return what the scenario gives its plug-in, as far as that can be told yet."""
     timeouts = document.value.get("timeouts")
     value = timeouts.get("loading_s") if isinstance(timeouts, dict) else None
-    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= 3600:
+    if is_real(value) and 0 < value <= 3600:
         return float(value)
     return Timeouts().loading_s
 

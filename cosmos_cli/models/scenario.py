@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
+from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.check_rules import CHECKS_MAX, CheckRule
 from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.planning import Planning
@@ -151,8 +151,8 @@ class Scenario(BaseModel):
 def cross_faults(
     scenario: Scenario,
     *,
-    skip: frozenset[str] = frozenset(),
-    labels: AgentLabels | None = NO_LABELS,
+    skip: frozenset[str],
+    labels: AgentLabels | None,
 ) -> list[SectionFault]:
     """
     Return what no single field can know to be wrong.

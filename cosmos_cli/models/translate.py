@@ -269,7 +269,7 @@ def _text(
     return f"{message[:1].lower()}{message[1:]}, got {got}"
 
 
-def known_keys(model: Any, path: Path, *, member: str = "") -> list[str]:
+def known_keys(model: Any, path: Path, *, member: str) -> list[str]:
     """Return the keys that *model* knows at *path*: of the union's *member*, or of all members together."""
     kinds = _types_at(model, path)
     meant = [kind for kind in kinds if getattr(kind, "__name__", "") == member]

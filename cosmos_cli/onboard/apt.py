@@ -152,7 +152,7 @@ def _ask_dpkg(names: Sequence[str]) -> dict[str, str]:
             [*DPKG_QUERY, *names],
             stdin=subprocess.DEVNULL,
             capture_output=True,
-            env=_environment(),
+            env={**os.environ, "PATH": tool_path(), **SILENT},
             timeout=QUERY_TIMEOUT_S,
             check=False,
         )
@@ -303,10 +303,6 @@ def _said(output: BinaryIO) -> str:
 def _last_line(text: str) -> str:
     lines = text.strip().splitlines()
     return lines[-1].strip()[:200] if lines else ""
-
-
-def _environment() -> dict[str, str]:
-    return {**os.environ, "PATH": tool_path(), **SILENT}
 
 
 def _apt_get() -> str:

@@ -121,7 +121,7 @@ def hash_of_tree(path: str, files: list[tuple[str, bool]]) -> str:
     return sha256("".join(lines).encode())
 
 
-def is_environment_whole(path: str, *, is_strict: bool = False) -> bool:
+def is_environment_whole(path: str, *, is_strict: bool) -> bool:
     """
     Tell whether an environment is whole and nobody touched it since it was built.
 

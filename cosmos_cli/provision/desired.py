@@ -78,8 +78,8 @@ def desired_state(
     *,
     home: str,
     read_file: Callable[[Path], Content],
-    environments: tuple[Environment, ...] = (),
-    trees: tuple[Tree, ...] = (),
+    environments: tuple[Environment, ...],
+    trees: tuple[Tree, ...],
 ) -> DesiredState:
     """
     Return what a machine should be like.

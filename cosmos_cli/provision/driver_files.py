@@ -31,7 +31,7 @@ class DriverFiles:
 def driver_files(
     machine: Machine,
     needs: MachineNeeds,
-    sent: Sequence[Path] = (),
+    sent: Sequence[Path],
 ) -> DriverFiles | None:
     """
     Return the files of a machine's own drivers; None if it has none, or all of them are sent already.

@@ -32,9 +32,9 @@ Answer = Mapping[str, Any]
 def fact_calls(
     desired: DesiredState,
     *,
-    has_texts: bool = False,
-    is_sudo_asked: bool = False,
-    touch: bool = False,
+    has_texts: bool,
+    is_sudo_asked: bool,
+    touch: bool,
 ) -> list[Call]:
     """
     Return the requests of which `gather_facts` makes facts.

@@ -123,7 +123,7 @@ def _condition(command: ShellCommand, *, home: str, as_root: bool) -> dict[str, 
 
 
 def declared_steps(
-    facts: MachineFacts, declared: tuple[DeclaredStep, ...], packages: Collection[str] = ()
+    facts: MachineFacts, declared: tuple[DeclaredStep, ...], packages: Collection[str]
 ) -> Iterator[Step]:
     """
     Yield the steps that are not done yet.

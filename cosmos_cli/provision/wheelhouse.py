@@ -26,7 +26,7 @@ from packaging.version import Version
 
 from cosmos_cli.cache import cache_folder
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.models.device_needs import NO_NEEDS, MachineNeeds
+from cosmos_cli.models.device_needs import MachineNeeds
 from cosmos_cli.models.inventory import Variables
 from cosmos_cli.provision import resolver
 from cosmos_cli.provision.lock import (
@@ -200,7 +200,7 @@ class EnvironmentNeed:
         requirements: Sequence[str],
         *,
         is_host: bool,
-        needs: MachineNeeds = NO_NEEDS,
+        needs: MachineNeeds,
     ) -> EnvironmentNeed:
         """
         Return the need of a machine.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from cosmos_cli.report.style import PALETTE, TONES, base_layout
+from madns_runtime.analysis.sampling import with_gaps
 from madns_runtime.analysis.values import Floats, SpaceFigure, SpacePath
 
 Trace = dict[str, Any]
@@ -79,11 +79,6 @@ def _scatter3d(points: Floats, colour: str, width: float, name: str) -> Trace:
     }
 
 
-def _with_gaps(pieces: Sequence[Floats]) -> Floats:
-    gap = np.full((1, 3), np.nan)
-    return np.concatenate([part for piece in pieces for part in (piece, gap)])
-
-
 def _sphere(radius: float) -> list[Trace]:
     """Return a calm sphere and its graticule."""
     longitude, latitude = np.linspace(0, 2 * np.pi, 61), np.linspace(-np.pi / 2, np.pi / 2, 31)
@@ -113,6 +108,6 @@ def _sphere(radius: float) -> list[Trace]:
         np.column_stack([np.cos(lat) * flat, np.cos(lat) * np.sin(angle), zero + np.sin(lat)])
         for lat in np.radians(range(-60, 61, 30))
     ]
-    circles = radius * GRATICULE_HEIGHT * _with_gaps([*meridians, *parallels])
+    circles = radius * GRATICULE_HEIGHT * with_gaps([*meridians, *parallels])
     graticule = _scatter3d(circles, GRATICULE_COLOUR, 1, "graticule") | {"hoverinfo": "skip"}
     return [sphere, graticule]

@@ -79,7 +79,7 @@ def log_axis(low: float, high: float) -> dict[str, Any]:
 
 
 def grid_layout(
-    titles: Sequence[str], *, columns: int = 2, row_px: int = 170, x_title: str = ""
+    titles: Sequence[str], *, columns: int, row_px: int, x_title: str
 ) -> tuple[dict[str, Any], int]:
     """Return the layout of a grid of plots, axes numbered from 1 row by row, and its height in pixels."""
     rows = -(-len(titles) // columns)

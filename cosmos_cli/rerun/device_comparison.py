@@ -58,7 +58,7 @@ class ChannelComparison:
 
 
 def compare_devices(
-    recorded: FlownRun, rerun: Path, ends: Collection[str] = ()
+    recorded: FlownRun, rerun: Path, ends: Collection[str]
 ) -> list[ChannelComparison]:
     """
     Compare the records of all devices with those of their playback.

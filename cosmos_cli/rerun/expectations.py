@@ -8,6 +8,7 @@ from typing import Any
 
 from cosmos_cli.evidence.expectations.of_run import planned_expectations
 from cosmos_cli.evidence.run_directory import RunDirectory
+from madns_runtime.plain_values import is_real
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,8 +72,7 @@ def _judged(run: RunDirectory) -> dict[str, Mapping[str, Any]]:
 
 
 def _number(value: Any) -> float | None:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if is_number else None
+    return float(value) if is_real(value) else None
 
 
 def _came_to(got: float | None, unit: str, *, is_held: bool) -> str:

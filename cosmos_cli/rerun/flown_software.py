@@ -125,7 +125,7 @@ def _put(run: RunDirectory, name: str, one: FlownFile, folder: Path, today: Path
     return ""
 
 
-def software_remarks(run: RunDirectory, folder: Path, which: str = "today's") -> tuple[str, ...]:
+def software_remarks(run: RunDirectory, folder: Path, which: str) -> tuple[str, ...]:
     """
     Say how the software of a folder, and what is installed, differ from what a run flew.
 

@@ -77,7 +77,7 @@ class FlownRun:
         return Path(self.config.base_directory)
 
 
-def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None = None) -> FlownRun:
+def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None) -> FlownRun:
     """
     Read what a rerun needs.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,17 @@ def as_array(values: NDArray[Any]) -> Floats:
         return values.astype(np.float64)
     numbers = [v if isinstance(v, int | float) else np.nan for v in values.tolist()]
     return np.array(numbers, dtype=np.float64)
+
+
+def as_rows(columns: Mapping[str, NDArray[Any]], names: Iterable[str]) -> Floats:
+    """Return columns beside each other as floats, a row per record, shape (N, M)."""
+    return np.column_stack([as_array(columns[name]) for name in names])
+
+
+def largest_size(values: Floats) -> float | None:
+    """Return the largest absolute value of those that are finite; None without any."""
+    finite = np.abs(values[np.isfinite(values)])
+    return float(finite.max()) if finite.size else None
 
 
 def points_per_series(count: int) -> int:
@@ -74,6 +86,12 @@ def with_breaks(x: Floats, y: Floats, starts: NDArray[np.int64]) -> tuple[Floats
     if not len(starts):
         return x, y
     return np.insert(x, starts, x[starts]), np.insert(y, starts, np.nan, axis=0)
+
+
+def with_gaps(pieces: Sequence[Floats]) -> Floats:
+    """Return lines in space, each of shape (N, 3), as one with a point of NaN behind each."""
+    gap = np.full((1, 3), np.nan)
+    return np.concatenate([part for piece in pieces for part in (piece, gap)])
 
 
 def thin_pieces(

@@ -82,7 +82,11 @@ class HostConditions:
         self._waiting: dict[int, list[OnMet]] = {}
         self._heard: list[MetCondition] = []
         self.tap = ConditionTap(
-            HOST, conditions, tick_hz=tick_hz, now_s=now_s, report=self._hear_of_half
+            HOST,
+            conditions,
+            tick_hz=tick_hz,
+            now_s=now_s,
+            report=lambda number, agent, t_s: self.hear(agent, number, t_s),
         )
         """For the recorder of the host's half."""
         self.unknown_count = 0
@@ -118,6 +122,3 @@ class HostConditions:
                 call(met)
             if met.condition.ends_run:
                 self._end(*ending_of(met), BROKEN)
-
-    def _hear_of_half(self, number: int, agent: str, t_s: float) -> None:
-        self.hear(agent, number, t_s)

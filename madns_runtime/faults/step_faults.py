@@ -8,10 +8,8 @@ and what ends one of these leaves alone those that began after its return.
 from __future__ import annotations
 
 import math
-from typing import Final
 
-HANG: Final = "hang"
-SLOW: Final = "slow"
+from madns_runtime.timeline.fault_kinds import HANG
 
 
 class StepFaults:

@@ -19,7 +19,7 @@ from madns_runtime.errors import ConfigurationError, MadnsError
 from madns_runtime.hardware.bounds import bound_faults
 from madns_runtime.hardware.fault_actions import check_fault
 from madns_runtime.hardware.order_socket import LineSocket, Readers
-from madns_runtime.plain_values import from_mapping, shown, to_mapping
+from madns_runtime.plain_values import from_mapping, is_real, shown, to_mapping
 from madns_runtime.timeline.action import ActionKind
 from madns_runtime.timeline.kinds import DEVICE_FAULT, DeviceFault
 from madns_runtime.timeline.runner import OrderedAction
@@ -242,8 +242,7 @@ def _length_s(kind: ActionKind, for_s: Any) -> float | None:
         if kind.lasting == "must":
             raise ConfigurationError(f"{kind.word} needs for_s: how long it lasts, s")
         return None
-    is_number = isinstance(for_s, int | float) and not isinstance(for_s, bool)
-    if not is_number or not math.isfinite(for_s) or for_s <= 0:
+    if not is_real(for_s) or not math.isfinite(for_s) or for_s <= 0:
         raise ConfigurationError(f"for_s: expected more than 0 s, got {for_s!r:.80}")
     if kind.lasting == "never":
         raise ConfigurationError(f"{kind.word} has no end: leave out for_s")

@@ -257,8 +257,8 @@ FRAMERS: Final[Mapping[Framing, Callable[[int], Framer]]] = {
 def make_framer(
     framing: Framing,
     frame_bytes_max: int,
-    length_bytes: int = 2,
-    length_order: Literal["little", "big"] = "little",
+    length_bytes: int,
+    length_order: Literal["little", "big"],
 ) -> Framer:
     """Return what cuts and wraps; the length's bytes and their order are those of `length_prefixed`."""
     if framing == "length_prefixed":

@@ -18,6 +18,7 @@ import orjson
 from madns_runtime import private_socket
 from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.fault_actions import check_fault
+from madns_runtime.plain_values import is_real
 
 SOCKET_NAME: Final = ".orders.sock"
 LINE_BYTES_MAX: Final = 65_536
@@ -163,6 +164,6 @@ class OrderSocket(LineSocket):
 
 
 def _number(value: object) -> float | None:
-    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+    if value is None or is_real(value):
         return None if value is None else float(value)
     raise ValueError(f"expected a number, got {value!r}")

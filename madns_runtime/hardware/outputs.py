@@ -193,7 +193,7 @@ class DeviceOutputs:
         elif not output.point.is_underrun:
             self._count(count_name("lost", output.channel.name), 1)
 
-    def note_refused(self, output: DueOutput | None = None) -> None:
+    def note_refused(self, output: DueOutput | None) -> None:
         """Take note that something is refused; a value that was due by the driver."""
         point = output.point if output is not None else None
         if point is None:

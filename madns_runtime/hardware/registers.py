@@ -223,7 +223,7 @@ class RegisterDevice(Device):
         self._bus.write(register.address, data)
 
 
-def decode_number(kind: RegisterType, data: bytes, shift: int = 0) -> float:
+def decode_number(kind: RegisterType, data: bytes, shift: int) -> float:
     """Return the number that bytes of a register hold."""
     order: Literal["little", "big"] = "big" if kind.endswith("_be") else "little"
     if kind.startswith("f"):
@@ -231,7 +231,7 @@ def decode_number(kind: RegisterType, data: bytes, shift: int = 0) -> float:
     return float(int.from_bytes(data, order, signed=kind.startswith("i")) >> shift)
 
 
-def encode_number(kind: RegisterType, number: float, shift: int = 0) -> bytes:
+def encode_number(kind: RegisterType, number: float, shift: int) -> bytes:
     """Return the bytes of a number, held to what the register can hold."""
     order: Literal["little", "big"] = "big" if kind.endswith("_be") else "little"
     # No integer of a register is larger, and infinity would be none.

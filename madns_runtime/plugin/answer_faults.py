@@ -10,6 +10,7 @@ from typing import Any
 from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.plain_values import (
     LINE_CHARACTERS_MAX,
+    are_texts,
     from_mapping,
     is_line,
     shown,
@@ -36,7 +37,7 @@ FIGURE_MAX = 1e18
 
 def texts_fault(found: Any) -> str | None:
     """Return what is wrong with the answer of `check` or `check_actions`; None if nothing is."""
-    if isinstance(found, list) and all(isinstance(text, str) for text in found):
+    if isinstance(found, list) and are_texts(found):
         return None
     return f"must return a list of texts, empty if nothing is wrong; got {shown(found)}"
 
@@ -93,13 +94,9 @@ def _kind_fault(item: Any) -> str | None:
 
 def rerun_fault(found: Any) -> str | None:
     """Return what is wrong with the answer of `rerun`; None if nothing is."""
-    if isinstance(found, Rerun) and _are_texts(found.remarks) and _are_texts(found.unlike):
+    if isinstance(found, Rerun) and are_texts(found.remarks) and are_texts(found.unlike):
         return None
     return f"must return a Rerun of madns_runtime.plugin.api, got {shown(found)}"
-
-
-def _are_texts(given: Any) -> bool:
-    return isinstance(given, tuple | list) and all(isinstance(text, str) for text in given)
 
 
 def streams_fault(found: Any) -> str | None:

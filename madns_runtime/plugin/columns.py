@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from madns_runtime.plugin.api import DeclaredStream
+from madns_runtime.recording.records import FRAMEWORK_SCHEMAS, StreamSchema
 
 COLUMNS_MAX = 6
 """As many values of an agent as fit its ping."""
@@ -28,6 +29,17 @@ def unknown_columns(columns: Sequence[str], streams: Iterable[DeclaredStream]) -
         f"columns: {column!r} is no field of an agent's stream that streams() declares"
         for column in columns
         if column not in known
+    ]
+
+
+def label_column_remarks(column: str, streams: Iterable[DeclaredStream]) -> list[str]:
+    """Return a remark per stream with a field that is called as the column of agents' second names."""
+    every: list[DeclaredStream | StreamSchema] = [*streams, *FRAMEWORK_SCHEMAS.values()]
+    return [
+        f"label_column: stream {stream.name} has a field {column!r} of its own, so that its table names no agent by its"
+        " label; choose another name"
+        for stream in every
+        if column in {field.name for field in stream.fields}
     ]
 
 

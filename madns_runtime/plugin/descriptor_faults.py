@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from madns_runtime.plain_values import LINE_CHARACTERS_MAX, is_line, shown
+from madns_runtime.plain_values import LINE_CHARACTERS_MAX, are_texts, is_line, shown
 from madns_runtime.plugin.columns import shape_faults
 from madns_runtime.plugin.kept_names import name_faults
 from madns_runtime.plugin.parameter_kinds import kind_faults
@@ -16,12 +16,8 @@ COLUMNS_OF_TABLES: Final = ("agent", "agent_name", "host", "incarnation", "t_s",
 """Columns that tables add to records: second names need one of their own."""
 
 
-def descriptor_faults(descriptor: Any) -> list[str]:
-    """Return a fault per field that is not what it must be, but for those that name parts."""
-    return [*_faults(descriptor)]
-
-
-def _faults(descriptor: Any) -> Iterator[str]:
+def descriptor_faults(descriptor: Any) -> Iterator[str]:
+    """Yield a fault per field that is not what it must be, but for those that name parts."""
     parameters = descriptor.parameters
     if not (isinstance(parameters, type) and dataclasses.is_dataclass(parameters)):
         yield "parameters: expected a dataclass (the class itself)"
@@ -37,7 +33,7 @@ def _faults(descriptor: Any) -> Iterator[str]:
             yield f"label_column: tables have a column {value!r} already; choose another name"
     yield from shape_faults(descriptor.columns)
     own = descriptor.agent_parameters
-    if own is not None and not _are_texts(own):
+    if own is not None and not are_texts(own):
         yield f"agent_parameters: expected a tuple of parameters' names, or None, got {shown(own)}"
     elif own and dataclasses.is_dataclass(parameters):
         known = {field.name for field in dataclasses.fields(parameters)}
@@ -45,7 +41,7 @@ def _faults(descriptor: Any) -> Iterator[str]:
             yield f"agent_parameters: there is no parameter {', '.join(map(shown, unknown))}"
     words = descriptor.placeholders
     if not isinstance(words, Mapping) or not all(
-        isinstance(field, str) and _are_texts(own) for field, own in words.items()
+        isinstance(field, str) and are_texts(own) for field, own in words.items()
     ):
         yield (
             "placeholders: expected a mapping of parameters' names to tuples of words, got"
@@ -57,10 +53,6 @@ def _faults(descriptor: Any) -> Iterator[str]:
         return
     yield from (f"actions: {text}" for text in kind_texts(actions))
     yield from (f"actions: {text}" for each in actions for text in _parameter_texts(each))
-
-
-def _are_texts(value: object) -> bool:
-    return isinstance(value, tuple | list) and all(isinstance(text, str) for text in value)
 
 
 def _parameter_texts(action: Any) -> list[str]:

@@ -338,7 +338,7 @@ def _checked(descriptor: Any, where: str, module: ModuleType) -> Simulation:
             f"{where}: expected a madns_runtime.plugin.api.Simulation, got {type(descriptor).__name__}"
         )
     try:
-        faults = descriptor_faults(descriptor)
+        faults = [*descriptor_faults(descriptor)]
     except Exception as error:  # a mapping's or a text's class may raise anything
         raise PluginError(f"{where}: looking at the descriptor: {said(error)}") from error
     parts: dict[str, Any] = {}

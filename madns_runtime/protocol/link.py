@@ -18,33 +18,20 @@ from typing import Final
 from madns_runtime.protocol.counters import LinkCounters
 from madns_runtime.protocol.datagram import (
     AT_ONCE,
-    BEST_BYTES_MAX,
     CHANNEL_MAX,
     ELICITING,
     HEADER_REST,
-    MESSAGE_BYTES_MAX,
     PREFIX_BYTES,
     STREAMS,
     Role,
     Seal,
     derive_keys,
 )
-from madns_runtime.protocol.deadlines import BrokenDeadline
-from madns_runtime.protocol.incoming import Incoming, Received
-from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkLimits, SendQueueFull
+from madns_runtime.protocol.incoming import Incoming
+from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkLimits
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.outgoing import Outgoing
 from madns_runtime.protocol.packets import Packets
-
-__all__ = [
-    "BEST_BYTES_MAX",
-    "MESSAGE_BYTES_MAX",
-    "BrokenDeadline",
-    "Link",
-    "LinkLimits",
-    "Received",
-    "SendQueueFull",
-]
 
 _BEST: Final = int(Service.BEST)
 _SYNC: Final = int(Service.SYNC)

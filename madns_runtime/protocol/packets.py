@@ -47,12 +47,11 @@ class RoundTrip:
     Source: RFC 6298 (smoothing), RFC 9002 (delays of the acknowledgement taken out).
     """
 
-    __slots__ = ("latest_s", "reorder_delay_s", "resend_delay_s", "srtt_s", "variation_s")
+    __slots__ = ("reorder_delay_s", "resend_delay_s", "srtt_s", "variation_s")
 
     def __init__(self) -> None:
         self.srtt_s: float | None = None
         self.variation_s = 0.0
-        self.latest_s = 0.0
         self.resend_delay_s = RESEND_FIRST_S
         self.reorder_delay_s = RESEND_FIRST_S
 
@@ -66,7 +65,6 @@ class RoundTrip:
             self.variation_s += (abs(srtt_s - sample_s) - self.variation_s) / 4
             srtt_s += (sample_s - srtt_s) / 8
         self.srtt_s = srtt_s
-        self.latest_s = sample_s
         slack_s = 4 * self.variation_s
         if slack_s < RESEND_SLACK_MIN_S:
             slack_s = RESEND_SLACK_MIN_S

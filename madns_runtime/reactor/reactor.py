@@ -24,8 +24,6 @@ from madns_runtime.reactor.libc import IS_LINUX
 from madns_runtime.reactor.poller import EpollPoller, Poller, SelectorPoller
 from madns_runtime.reactor.timers import Timer, TimerQueue
 
-__all__ = ["Reactor", "Timer"]
-
 Callback = Callable[[], None]
 
 TIMERS_BATCH_MAX = 64

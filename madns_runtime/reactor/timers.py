@@ -31,11 +31,6 @@ class Timer:
         self.when_s = when_s
         """Time at which it fires or fired, s of the reactor's clock."""
 
-    @property
-    def is_pending(self) -> bool:
-        """Whether it is still to fire."""
-        return self._queued_s is not None
-
     def cancel(self) -> None:
         """Do not fire; without effect on a timer that is not pending."""
         self._queue.cancel(self)

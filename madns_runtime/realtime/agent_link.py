@@ -17,8 +17,7 @@ from madns_runtime.plugin.api import HOST
 from madns_runtime.plugin.context import check_sending
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.protocol.agent_session import AgentIdentity, AgentSession
-from madns_runtime.protocol.link import LinkLimits
-from madns_runtime.protocol.link_settings import LinkSettings
+from madns_runtime.protocol.link_settings import LinkLimits, LinkSettings
 from madns_runtime.protocol.messages import ConditionMet, Service, Transmission
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.realtime.process_port import ProcessPort

@@ -14,8 +14,7 @@ from madns_runtime.plugin.context import check_sending
 from madns_runtime.protocol.bundle import bundle_up, is_bundle, split
 from madns_runtime.protocol.host_peers import Address
 from madns_runtime.protocol.host_session import HostSession
-from madns_runtime.protocol.link import LinkLimits
-from madns_runtime.protocol.link_settings import LinkSettings
+from madns_runtime.protocol.link_settings import LinkLimits, LinkSettings
 from madns_runtime.protocol.messages import Delivery, Service, TransmissionRefusal
 from madns_runtime.protocol.states import HostState
 from madns_runtime.reactor.reactor import Reactor
@@ -25,7 +24,6 @@ BEST, SYNC = Service.BEST, Service.SYNC
 
 PACE_TOTAL_BYTES_PER_S = 100e6
 """Rate of RELIABLE fragments to all agents together, beyond bursts: most of a gigabit network."""
-T_S_DIGITS = 6
 
 
 class HostPort:

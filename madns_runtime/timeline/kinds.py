@@ -131,7 +131,7 @@ FRAMEWORK_ACTIONS: Final = (
 )
 
 
-def kinds_by_word(declared: Iterable[ActionKind] = ()) -> Mapping[str, ActionKind]:
+def kinds_by_word(declared: Iterable[ActionKind]) -> Mapping[str, ActionKind]:
     """Return all kinds of a run by their words: the framework's, and those that its simulation declares."""
     return {kind.word: kind for kind in (*FRAMEWORK_ACTIONS, *declared)}
 

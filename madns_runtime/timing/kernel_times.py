@@ -20,9 +20,9 @@ READ_BYTES: Final = 4096
 READINGS_MAX: Final = 64
 
 
-def thread_computed_s(thread_id: int, tasks: Path = TASKS) -> float:
+def thread_computed_s(thread_id: int) -> float:
     """Return the CPU time of a thread of this process since its start, s; 0 where not told, or it has ended."""
-    fields = _read(tasks / str(thread_id) / SCHEDSTAT.name).split()
+    fields = _read(TASKS / str(thread_id) / SCHEDSTAT.name).split()
     return int(fields[0]) * 1e-9 if fields else 0.0
 
 

@@ -21,7 +21,6 @@ from madns_runtime.simulations.constellation.orbit.quaternions import (
     rotate,
     rotate_back,
     rotation_between,
-    to_matrix,
 )
 
 numbers = st.floats(-1.0, 1.0)
@@ -32,6 +31,18 @@ quaternions = (
 )
 vectors = st.tuples(numbers, numbers, numbers)
 QUARTER_ABOUT_Z = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+
+
+def to_matrix(q):
+    """Return the 3x3 matrix that takes inertial components to body components; *q* of unit length."""
+    x, y, z, w = (float(number) for number in q)
+    return np.array(
+        (
+            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)),
+            (2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)),
+            (2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)),
+        )
+    )
 
 
 def test_a_body_turned_about_z_sees_inertial_x_along_minus_y():

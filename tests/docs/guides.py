@@ -1,7 +1,10 @@
 """What a person reads, and what of it is a command."""
 
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -43,3 +46,22 @@ def row_keys(text, heading):
     section = text.split(f"\n{heading}\n", 1)[1].split("\n#", 1)[0]
     firsts = re.findall(r"^\| ([^|]*`[^|]*?) \|", section.replace("\\|", "/"), flags=re.M)
     return [key for first in firsts for key in re.findall(r"`([^`]+)`", first)]
+
+
+def run(command, folder, **variables):
+    """Run lines of a guide in a shell that finds `cosmos`, in a folder, with a register of processes there."""
+    environment = {
+        **os.environ,
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "COSMOS_STATE_DIR": str(folder / "state"),
+        **variables,
+    }
+    return subprocess.run(
+        ["bash", "-ec", command],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=240,
+    )

@@ -1,15 +1,13 @@
 """docs/ci.md and its job: the job's file is one that GitHub takes, its commands run, and the guide's examples hold."""
 
-import os
 import re
 import shlex
-import subprocess
 import sys
 
 import jsonschema
 import pytest
 import yaml
-from guides import ROOT, blocks
+from guides import ROOT, blocks, run
 
 from cosmos_cli.commands.command_group import each_command
 from cosmos_cli.models.baseline import read_baseline
@@ -160,7 +158,7 @@ def test_its_commands_run_one_after_the_other(tmp_path):
     (tmp_path / "scenarios/ring.yaml").write_text(SCENARIO)
     for words in (step["run"] for step in JOB["jobs"]["quick"]["steps"] if "run" in step):
         if words.startswith("cosmos "):
-            done = run(words, tmp_path)
+            done = run(words, tmp_path, COSMOS_RUNS=str(tmp_path / "runs"))
             assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "results/junit.xml").is_file()
 
@@ -171,7 +169,9 @@ def test_the_guides_pytest_example_runs(tmp_path):
     (block,) = blocks(GUIDE, "python")
     (tmp_path / "test_ring.py").write_text(block)
     done = run(
-        f"{shlex.quote(sys.executable)} -m pytest -q -p no:cacheprovider test_ring.py", tmp_path
+        f"{shlex.quote(sys.executable)} -m pytest -q -p no:cacheprovider test_ring.py",
+        tmp_path,
+        COSMOS_RUNS=str(tmp_path / "runs"),
     )
 
     assert done.returncode == 0, done.stdout + done.stderr
@@ -193,21 +193,3 @@ def test_the_guide_shows_the_jobs_heart():
     shown = " ".join(GUIDE.split())
     quick = next(" ".join(words) for words in commands() if words[:2] == ["cosmos", "test"])
     assert quick in shown
-
-
-def run(command, folder):
-    environment = {
-        **os.environ,
-        "PATH": f"{os.path.dirname(sys.executable)}:{os.environ['PATH']}",
-        "COSMOS_STATE_DIR": str(folder / "state"),
-        "COSMOS_RUNS": str(folder / "runs"),
-    }
-    return subprocess.run(
-        ["bash", "-ec", command],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=240,
-    )

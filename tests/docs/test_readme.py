@@ -1,13 +1,12 @@
 """What the README tells a person to do, done."""
 
-import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from guides import run
 from harness.cosmos_command import LOOSE
 
 from cosmos_cli import app
@@ -19,24 +18,6 @@ ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text("utf-8")
 TESTED = re.findall(r"<!-- tested -->\n```sh\n(.*?)```", README, flags=re.S)
 PATIENT = " ".join(f"--set {setting}" for setting in LOOSE)
-
-
-def run(command, folder, **variables):
-    environment = {
-        **os.environ,
-        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
-        "COSMOS_STATE_DIR": str(folder / "state"),
-        **variables,
-    }
-    return subprocess.run(
-        ["bash", "-ec", command],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=240,
-    )
 
 
 def test_tutorial_runs_from_its_first_command_to_its_last(tmp_path):

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 from fault_harness import Laboratory
+from harness.acting import ACTING
 
 from madns_runtime.recording.reader import read_stream
 
@@ -85,22 +86,6 @@ def test_processes_that_are_killed_on_purpose_return_and_cost_no_verdict(laborat
     assert counts["lost"] > 0 and counts["doubled"] > 0
     assert counts["late"] == counts["released"]
     assert result["messages"]["reliable"]["lost"] == result["messages"]["sync"]["lost"] == 0
-
-
-ACTING = """
-from dataclasses import dataclass
-from madns_runtime.plugin.api import ActionKind, AgentSimulation, Simulation
-@dataclass(frozen=True)
-class Parameters:
-    pass
-class Agent(AgentSimulation):
-    def begin_action(self, action):
-        raise ValueError("told to")
-simulation = Simulation(
-    name="acting", parameters=Parameters, agent=":Agent",
-    actions=(ActionKind(word="act", summary="Acts.", carried_out_by="agent"),),
-)
-"""
 
 
 def test_an_end_on_purpose_takes_no_return_from_an_agent_that_fails_later(laboratory):

@@ -1,6 +1,7 @@
 """A lockstep run with on_agent_loss: continue goes on without an agent, and with it again, and repeats to the bit."""
 
 import pytest
+from harness.acting import ACTING
 
 from madns_runtime.config import Timeouts
 from madns_runtime.timeline.entries import ScheduledEntry
@@ -99,22 +100,6 @@ def test_a_run_that_has_lost_everybody_ends_and_says_why(start_host):
     assert result["status"] == "failed"
     assert result["who"].startswith("agent-01, agent-02")
     assert "was killed by SIGKILL in the agent's step, at t = 0.2 s" in result["reason"]
-
-
-ACTING = """
-from dataclasses import dataclass
-from madns_runtime.plugin.api import ActionKind, AgentSimulation, Simulation
-@dataclass(frozen=True)
-class Parameters:
-    pass
-class Agent(AgentSimulation):
-    def begin_action(self, action):
-        raise ValueError("told to")
-simulation = Simulation(
-    name="acting", parameters=Parameters, agent=":Agent",
-    actions=(ActionKind(word="act", summary="Acts.", carried_out_by="agent"),),
-)
-"""
 
 
 def test_an_agent_whose_action_raises_is_lost_alone(start_host, tmp_path):

@@ -1,6 +1,5 @@
 """The pure parts of lockstep: who shares a worker, what travels, what is recorded."""
 
-import errno
 import json
 import os
 import socket
@@ -8,6 +7,7 @@ import subprocess
 from types import SimpleNamespace
 
 import pytest
+from harness import full_disk
 
 from madns_runtime.config import Agents, RunConfig, Timeouts, TimeSettings
 from madns_runtime.errors import MachineError, MessageTooLarge, PeerError
@@ -128,11 +128,7 @@ def test_records_carry_simulated_time_alone(tmp_path):
 def test_a_full_disk_ends_it_instead_of_costing_records(tmp_path, monkeypatch):
     journal = open_journal(tmp_path, config(), source="host", clock=SimulatedClock(0.0))
     journal.recorder.open_stream(OWN)
-
-    def refuse(fd, data):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(stream_file.os, "write", refuse)
+    monkeypatch.setattr(stream_file.os, "write", full_disk.refuse)
     with pytest.raises(MachineError, match="own.jsonl: No space left on device"):
         for number in range(1000):
             journal.recorder.record("own", (number, "x" * 1000))
@@ -179,11 +175,7 @@ def test_a_worker_that_only_closes_its_line_does_not_live_on(tmp_path, monkeypat
 def test_a_run_on_a_full_disk_still_comes_to_its_end(tmp_path, monkeypatch):
     journal = open_journal(tmp_path, config(), source="host", clock=SimulatedClock(0.0))
     journal.recorder.open_stream(OWN)
-
-    def refuse(fd, data):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(stream_file.os, "write", refuse)
+    monkeypatch.setattr(stream_file.os, "write", full_disk.refuse)
     with pytest.raises(MachineError):
         for number in range(1000):
             journal.recorder.record("own", (number, "x" * 1000))

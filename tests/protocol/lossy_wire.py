@@ -6,7 +6,10 @@ import heapq
 import random
 from dataclasses import dataclass, field
 
-from madns_runtime.protocol.link import BrokenDeadline, Link, LinkLimits, Received
+from madns_runtime.protocol.deadlines import BrokenDeadline
+from madns_runtime.protocol.incoming import Received
+from madns_runtime.protocol.link import Link
+from madns_runtime.protocol.link_settings import LinkLimits
 from madns_runtime.protocol.messages import Service
 
 RUN_KEY = bytes(range(32))

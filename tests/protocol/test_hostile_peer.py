@@ -17,7 +17,8 @@ from madns_runtime.protocol.datagram import (
     Seal,
     derive_keys,
 )
-from madns_runtime.protocol.link import Link, LinkLimits, SendQueueFull
+from madns_runtime.protocol.link import Link
+from madns_runtime.protocol.link_settings import LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.sending import LOST_PACKETS_MAX
 

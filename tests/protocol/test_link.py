@@ -8,24 +8,20 @@ from lossy_wire import RUN_KEY, SESSION, Faults, LossyWire
 from madns_runtime.errors import MadnsError, MessageTooLarge
 from madns_runtime.protocol import sending
 from madns_runtime.protocol.datagram import (
+    BEST_BYTES_MAX,
     DATAGRAM_BYTES_MAX,
     FRAME,
     FRAME_BYTES,
     HEADER_BYTES,
     MAC_BYTES,
+    MESSAGE_BYTES_MAX,
     OVERHEAD_BYTES,
     Header,
 )
-from madns_runtime.protocol.deadlines import BROKEN_UNREAD_MAX
-from madns_runtime.protocol.link import (
-    BEST_BYTES_MAX,
-    MESSAGE_BYTES_MAX,
-    BrokenDeadline,
-    Link,
-    LinkLimits,
-    Received,
-    SendQueueFull,
-)
+from madns_runtime.protocol.deadlines import BROKEN_UNREAD_MAX, BrokenDeadline
+from madns_runtime.protocol.incoming import Received
+from madns_runtime.protocol.link import Link
+from madns_runtime.protocol.link_settings import LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.packets import ACK_DELAY_MAX_S, RoundTrip, TokenBucket
 

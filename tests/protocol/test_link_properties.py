@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from lossy_wire import Faults, LossyWire
 
 from madns_runtime.protocol.datagram import PREFIX_BYTES, REST
-from madns_runtime.protocol.link import LinkLimits, SendQueueFull
+from madns_runtime.protocol.link_settings import LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import Service
 
 STREAMS = (Service.RELIABLE, Service.SYNC)

@@ -18,8 +18,13 @@ from madns_runtime.protocol.codec import (
     encode_data,
     encode_message,
 )
-from madns_runtime.protocol.datagram import DATAGRAM_BYTES_MAX, MAC_BYTES, OVERHEAD_BYTES
-from madns_runtime.protocol.link import BEST_BYTES_MAX, Link
+from madns_runtime.protocol.datagram import (
+    BEST_BYTES_MAX,
+    DATAGRAM_BYTES_MAX,
+    MAC_BYTES,
+    OVERHEAD_BYTES,
+)
+from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.messages import Ping, Service, SimulationData
 from madns_runtime.protocol.packets import (
     ACK_BITS,

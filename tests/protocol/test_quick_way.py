@@ -9,8 +9,8 @@ from test_sessions import World
 from madns_runtime.protocol import events as a
 from madns_runtime.protocol import events as h
 from madns_runtime.protocol.codec import NO_DATA, UnencodableValue
+from madns_runtime.protocol.datagram import BEST_BYTES_MAX
 from madns_runtime.protocol.events import Phase
-from madns_runtime.protocol.link import BEST_BYTES_MAX
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.states import HostState
 

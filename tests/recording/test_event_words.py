@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 import madns_runtime
-from madns_runtime.faults.step_faults import HANG, SLOW
 from madns_runtime.recording.records import (
     AGENT_EVENT_WORDS,
     DEVICE_EVENT_WORDS,
@@ -12,6 +11,7 @@ from madns_runtime.recording.records import (
     HOST_EVENT_WORDS,
 )
 from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED, RESUMED
+from madns_runtime.timeline.fault_kinds import HANG, SLOW
 
 
 def test_all_words_of_events_are_known_and_no_others():

@@ -100,7 +100,7 @@ class AnswerReader:
                 f"expected at most {expected.body_bytes_max} bytes after it, got {size}",
             )
         while len(self._buffer) < size:
-            self._more(patience, timeout_s, READ_BYTES)
+            self._more(patience, timeout_s)
         body = bytes(self._buffer[:size])
         del self._buffer[:size]
         return header, body
@@ -116,18 +116,18 @@ class AnswerReader:
                     f" {_said(bytes(self._buffer[: SAID_BYTES_MAX + 1]))}",
                     TALKS_ADVICE,
                 )
-            self._more(patience, timeout_s, READ_BYTES)
+            self._more(patience, timeout_s)
             end = self._buffer.find(b"\n", searched)
         line = bytes(self._buffer[:end])
         del self._buffer[: end + 1]
         return line
 
-    def _more(self, patience: Patience, timeout_s: float, count: int) -> None:
+    def _more(self, patience: Patience, timeout_s: float) -> None:
         left_s = patience.left_s
         if left_s <= 0:
             raise _too_late(patience, timeout_s)
         try:
-            data = self._source.read_some(count, timeout_s=left_s)
+            data = self._source.read_some(READ_BYTES, timeout_s=left_s)
         except MachineFailure as failure:
             if failure.kind is not FailureKind.TIMEOUT:
                 raise

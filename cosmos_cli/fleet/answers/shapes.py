@@ -122,14 +122,14 @@ def maybe(shape: Shape) -> Shape:
     return check
 
 
-def list_of(shape: Shape, *, count_max: int = COUNT_MAX) -> Shape:
+def list_of(shape: Shape) -> Shape:
     """Return the shape of a list of bounded length, all items alike."""
 
     def check(value: object, where: str) -> None:
         if not isinstance(value, list):
             raise WrongShape(where, "a list", value)
-        if len(value) > count_max:
-            raise WrongShape(where, f"a list of at most {count_max}", value)
+        if len(value) > COUNT_MAX:
+            raise WrongShape(where, f"a list of at most {COUNT_MAX}", value)
         for index, item in enumerate(value):
             shape(item, f"{where}[{index}]")
 
@@ -148,13 +148,13 @@ def row(shapes: Sequence[Shape]) -> Shape:
     return check
 
 
-def map_of(shape: Shape, *, count_max: int = COUNT_MAX) -> Shape:
+def map_of(shape: Shape) -> Shape:
     """Return the shape of a map of bounded size, all values alike."""
 
     def check(value: object, where: str) -> None:
         items = _items(value, where)
-        if len(items) > count_max:
-            raise WrongShape(where, f"a map of at most {count_max}", value)
+        if len(items) > COUNT_MAX:
+            raise WrongShape(where, f"a map of at most {COUNT_MAX}", value)
         for key, item in items.items():
             shape(item, f"{where}.{_shown_key(key)}")
 

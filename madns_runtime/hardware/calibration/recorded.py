@@ -18,9 +18,9 @@ FILES_MAX = 64
 def read_samples(
     folder: Path,
     sensor: SensorName,
-    channel: str | None = None,
+    channel: str | None,
     *,
-    limits: tuple[float, float] | None = None,
+    limits: tuple[float, float] | None,
 ) -> ChannelSamples:
     """
     Return what a sensor's channel gave, without samples that hold no numbers.

@@ -48,7 +48,7 @@ def flight_faults(
     names: Sequence[tuple[str, str]],
     base_directory: Path,
     *,
-    is_lockstep: bool = False,
+    is_lockstep: bool,
 ) -> list[str]:
     """
     Return the faults.

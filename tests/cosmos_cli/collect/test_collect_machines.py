@@ -6,6 +6,7 @@ import json
 import sys
 
 import pytest
+from harness import full_disk
 from harness.split_run import SplitRun, hashes
 
 from cosmos_cli import app
@@ -36,9 +37,7 @@ class Network:
 
 
 @pytest.fixture(autouse=True)
-def network(tmp_path, monkeypatch):
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+def network(own_places, monkeypatch):
     network = Network()
     monkeypatch.setattr(retrieve, "_connect", network.connect)
     return network
@@ -77,10 +76,7 @@ def test_records_of_all_machines_come_and_the_run_is_judged(split, capsys):
 
 
 def test_package_that_was_not_written_is_not_said_to_be_there(split, monkeypatch, capsys):
-    def refuse(*_arguments, **_more):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(finish, "pack_run", refuse)
+    monkeypatch.setattr(finish, "pack_run", full_disk.refuse)
 
     assert app.run(["collect"]) == 5
 

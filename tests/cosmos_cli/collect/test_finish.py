@@ -8,6 +8,7 @@ import orjson
 import pyarrow.parquet as pq
 import pytest
 import zstandard
+from harness import full_disk
 from harness.synthetic_run import SyntheticRun, make_config
 
 from cosmos_cli.collect import finish as finish_module
@@ -471,13 +472,12 @@ def test_file_without_holes_is_read_however_large(tmp_path):
 
 def test_full_disk_still_gets_a_summary_that_names_what_is_not_written(tmp_path, monkeypatch):
     made = SyntheticRun(tmp_path).write()
-
-    def refuse(*_arguments, **_more):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("cosmos_cli.evidence.tabulate.TableWriter", refuse)
-    monkeypatch.setattr("cosmos_cli.collect.finish.write_report", refuse)
-    monkeypatch.setattr("cosmos_cli.collect.finish.pack_run", refuse)
+    for what in (
+        "evidence.tabulate.TableWriter",
+        "collect.finish.write_report",
+        "collect.finish.pack_run",
+    ):
+        monkeypatch.setattr(f"cosmos_cli.{what}", full_disk.refuse)
 
     summary = finish(made, has_report=True)
 

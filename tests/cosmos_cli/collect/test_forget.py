@@ -17,10 +17,8 @@ pytestmark = pytest.mark.process
 
 
 @pytest.fixture
-def asked(tmp_path, monkeypatch):
+def asked(own_places, monkeypatch):
     """Who was connected to; what is in `off` does not answer."""
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
     names = []
 
     def connect(target, _options):

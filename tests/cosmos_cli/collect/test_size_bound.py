@@ -25,14 +25,10 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.local import LocalConnection
 
+pytestmark = pytest.mark.usefixtures("own_places")
+
 NINE_TB = 9 * 10**12
 Usage = namedtuple("Usage", "total used free")
-
-
-@pytest.fixture(autouse=True)
-def own_register(tmp_path, monkeypatch):
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
 
 
 @pytest.fixture

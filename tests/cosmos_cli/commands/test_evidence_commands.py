@@ -9,11 +9,7 @@ from cosmos_cli import app
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.evidence.run_documents import Problem
 
-
-@pytest.fixture(autouse=True)
-def own_register(tmp_path, monkeypatch):
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+pytestmark = pytest.mark.usefixtures("own_places")
 
 
 @pytest.fixture
@@ -67,6 +63,18 @@ def test_runs_lists_what_was_run(made, capsys):
     first, second = json.loads(capsys.readouterr().out)
     assert (first["run"], first["status"], first["exit_code"]) == ("0001-synthetic", "complete", 0)
     assert (second["run"], second["status"]) == ("0002-synthetic", "cut off")
+
+
+@pytest.mark.parametrize(
+    ("status", "shown"), [("complete", "20 s "), ("interrupted", "20 s planned")]
+)
+def test_runs_tell_a_planned_duration_from_one_that_was_simulated(made, capsys, status, shown):
+    finish_run(made.run, made.result(status=status), made.expected, has_report=False)
+
+    assert app.run(["runs"]) == 0
+
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if "0001-synthetic" in x]
+    assert f"  {shown}" in line
 
 
 def test_run_that_went_on_without_its_operator_is_not_called_cut_off(made, capsys):
@@ -218,6 +226,20 @@ def test_pipe_among_the_tables_is_named_and_not_waited_for(made, capsys):
     assert app.run(["diff", "1", "1"]) == 0
     assert "links or no files: tables/pipe.parquet" in capsys.readouterr().out
     assert app.run(["collect", "1"]) == 0
+
+
+@pytest.mark.parametrize("arguments", [["report", "1"], ["diff", "1", "1"]])
+def test_table_that_no_collection_made_is_not_read_for_the_run(made, capsys, arguments):
+    finish(made)
+    (made.run.tables / "foreign.parquet").write_bytes(
+        (made.run.tables / "round_trips.parquet").read_bytes()
+    )
+
+    assert app.run(arguments) == 2
+    assert "foreign.parquet: no collection made it" in capsys.readouterr().err
+
+    made.run.manifest_json.unlink()  # nobody knows what was collected
+    assert app.run(arguments) == 0
 
 
 @pytest.mark.slow

@@ -10,13 +10,9 @@ from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.diff import recorded
 from madns_runtime.recording.records import Field, StreamSchema
 
+pytestmark = pytest.mark.usefixtures("own_places")
+
 AGENTS, TICKS = 3, 300
-
-
-@pytest.fixture(autouse=True)
-def own_places(tmp_path, monkeypatch):
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
 
 
 @pytest.fixture

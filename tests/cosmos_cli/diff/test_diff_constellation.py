@@ -89,9 +89,7 @@ class Flown(SyntheticRun):
 
 
 @pytest.fixture
-def fly(tmp_path, monkeypatch):
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+def fly(own_places, tmp_path):
 
     def fly_run(
         *, frame="TEME", epoch="2017-03-07T12:00:00Z", result=None, shutdown_s=None, **what

@@ -4,6 +4,7 @@ import tarfile
 
 import pytest
 import zstandard
+from harness import full_disk
 from harness.nested_folders import nested_folders
 from harness.synthetic_run import SyntheticRun
 
@@ -79,10 +80,7 @@ def test_package_that_cannot_be_written_leaves_the_old_one_and_no_rest(tmp_path,
     made = SyntheticRun(tmp_path).write()
     before = pack_run(made.run, MTIME_S).read_bytes()
 
-    def refuse(_descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("cosmos_cli.evidence.manifest.os.fsync", refuse)
+    monkeypatch.setattr("cosmos_cli.evidence.manifest.os.fsync", full_disk.refuse)
     with pytest.raises(OSError, match="No space"):
         pack_run(made.run, MTIME_S)
 

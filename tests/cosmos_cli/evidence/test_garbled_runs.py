@@ -21,6 +21,8 @@ from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.living_processes import unfinished_runs
 from cosmos_cli.report.build import build_sections
 
+pytestmark = pytest.mark.usefixtures("own_places")
+
 NAMES = ("run.json", "result.json", "plan.json", "manifest.json")
 FOUND = [("result.json", ("who",), {}), ("run.json", ("agents", "lost"), 10**30)]
 """What once ended in a traceback: tried each time."""
@@ -39,12 +41,6 @@ WRONG = (
     "\x1b[31m",
     {"name": []},
 )
-
-
-@pytest.fixture(autouse=True)
-def own_register(tmp_path, monkeypatch):
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
 
 
 @pytest.fixture(scope="module")

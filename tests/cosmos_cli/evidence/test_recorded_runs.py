@@ -21,10 +21,8 @@ SAFELY = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}
 
 
 @pytest.fixture(params=ARCHIVES, ids=lambda path: path.name)
-def runs(request, tmp_path, monkeypatch):
+def runs(request, own_places, tmp_path):
     """A copy of the runs in an archive."""
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
     with (
         request.param.open("rb") as packed,
         zstandard.ZstdDecompressor(max_window_size=EXTRACTED_BYTES_MAX * 8).stream_reader(

@@ -7,6 +7,7 @@ import threading
 
 import orjson
 import pytest
+from harness import full_disk
 from harness.registered import registered
 from harness.synthetic_run import make_config
 
@@ -218,10 +219,7 @@ def test_failed_replacement_leaves_the_old_file_and_no_rest(tmp_path, monkeypatc
     path = tmp_path / "run.json"
     write_whole(path, b"old")
 
-    def refuse(_descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("madns_runtime.partial_file.os.fsync", refuse)
+    monkeypatch.setattr("madns_runtime.partial_file.os.fsync", full_disk.refuse)
     with pytest.raises(OSError, match="No space"):
         write_whole(path, b"new")
 
@@ -242,10 +240,7 @@ def test_unreadable_json_is_none(tmp_path):
 def test_run_that_could_not_be_made_is_not_there_to_be_collected(tmp_path, monkeypatch, what):
     create_run(tmp_path, "a")
 
-    def refuse(*_arguments, **_options):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(f"cosmos_cli.evidence.run_directory.{what}", refuse)
+    monkeypatch.setattr(f"cosmos_cli.evidence.run_directory.{what}", full_disk.refuse)
     with pytest.raises(InputError, match="No space"):
         create_run(tmp_path, "b")
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from harness.synthetic_run import MACHINE, SyntheticRun, make_config
@@ -493,6 +494,23 @@ def test_time_zero_is_the_epoch_of_summary_or_parameters_whatever_the_simulation
     assert TableLabels.of(nothing, {**result, "simulation": {}}).zero_utc is None
 
 
+@pytest.mark.parametrize("is_told_by_the_host", [True, False])
+def test_time_zero_that_is_no_time_is_remarked_on_as_tables_have_no_utc(
+    tmp_path, is_told_by_the_host
+):
+    given = {"epoch_utc": "noon\x1b"}
+    config = make_config(parameters={} if is_told_by_the_host else given)
+    made = SyntheticRun(tmp_path, config).write()
+    result = made.result(simulation=given if is_told_by_the_host else {})
+
+    finish_run(made.run, result, made.expected, has_report=False)
+
+    assert (
+        "tables have no simulated_utc: expected an epoch_utc such as 2017-03-07T12:00:00Z, got 'noon\\x1b'"
+        in made.run.read_json(made.run.run_json)["remarks"]
+    )
+
+
 def test_nothing_is_labelled_where_time_zero_is_not_known(tmp_path):
     made = SyntheticRun(tmp_path).write(with_states=True)
     finish_run(made.run, None, made.expected, has_report=False)
@@ -511,6 +529,13 @@ def test_readers_of_tables_take_labels_for_no_recorded_field(tmp_path):
 
     assert [field.name for field in table.fields][:3] == ["t_s", "tick", "x_m"]
     assert table.has("satellite", "simulated_utc")
+
+
+@pytest.mark.parametrize("about", [None, {b"cosmos": b"[1]"}, {b"cosmos": b"{}"}])
+def test_parquet_file_of_somebody_else_is_no_table(tmp_path, about):
+    pq.write_table(pa.table({"a": [1.0]}).replace_schema_metadata(about), tmp_path / "mine.parquet")
+
+    assert open_tables(tmp_path) == {}
 
 
 def test_times_without_a_utc_are_null(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cosmos_cli.models.inventory import expand
+from cosmos_cli.models.inventory.names import expand
 from cosmos_cli.ui.name_ranges import compact
 
 SHORTENED = [

@@ -246,3 +246,18 @@ def test_faults_by_the_hundred_thousand_are_counted(tmp_path):
         load_scenario(path)
 
     assert told.value.omitted == 200_000 - len(told.value.faults)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("column", ["x", "offset_us"])
+def test_label_column_that_a_stream_has_as_a_field_is_remarked_on(load, tmp_path, column):
+    plugin = PLUGIN.replace('place_uses=":place_uses"', f'label_column="{column}"')
+    (tmp_path / "plug.py").write_text(plugin)
+
+    scenario = load(OWN + "  - {agents: [agent-2], parameters: {mass_kg: 3}}\n")
+
+    stream = "drive" if column == "x" else "clock"
+    assert [remark.text for remark in scenario.remarks] == [
+        f"label_column: stream {stream} has a field {column!r} of its own, so that its table names no agent by its label;"
+        " choose another name"
+    ]

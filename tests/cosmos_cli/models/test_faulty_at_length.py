@@ -18,7 +18,8 @@ import pytest
 from cosmos_cli import app
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
 from cosmos_cli.models.document import GUESSES_MAX, read_document
-from cosmos_cli.models.inventory import Machine, read_inventory
+from cosmos_cli.models.inventory import Machine
+from cosmos_cli.models.inventory.load import read_inventory
 from cosmos_cli.models.limit import select_machines
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.models.overrides import apply_overrides

@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.models.inventory import expand, load_machines
-from cosmos_cli.models.inventory.names import split_port
+from cosmos_cli.models.inventory import load_machines
+from cosmos_cli.models.inventory.names import expand, split_port
 
 ROOT = Path(__file__).parents[3]
 

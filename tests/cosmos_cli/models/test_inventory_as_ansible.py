@@ -11,7 +11,8 @@ import yaml
 
 from cosmos_cli import app
 from cosmos_cli.errors import InputError
-from cosmos_cli.models.inventory import load_machines, read_inventory
+from cosmos_cli.models.inventory import load_machines
+from cosmos_cli.models.inventory.load import read_inventory
 
 pytestmark = [
     pytest.mark.process,

@@ -13,7 +13,8 @@ from test_inventory_as_ansible import random_inventory
 from cosmos_cli import app
 from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.fleet import fleet_of
-from cosmos_cli.models.inventory import load_machines, read_inventory
+from cosmos_cli.models.inventory import load_machines
+from cosmos_cli.models.inventory.load import read_inventory
 
 needs_ansible = pytest.mark.skipif(
     importlib.util.find_spec("ansible") is None,

@@ -1,6 +1,5 @@
 """What works on a machine changes files whole or not at all, and sees its commands through."""
 
-import errno
 import io
 import os
 import stat
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from fake_system import connection_to
+from harness import full_disk
 from harness.waiting import is_alive, wait_until
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -128,10 +128,7 @@ def test_failure_at_any_point_leaves_the_old_file_alone(tmp_path, monkeypatch, f
     path = tmp_path / "a"
     path.write_text("old")
 
-    def fail(*_arguments):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(files.os, function, fail)
+    monkeypatch.setattr(files.os, function, full_disk.refuse)
     with pytest.raises(OSError, match="No space"):
         replace_file(str(path), b"new", {})
 

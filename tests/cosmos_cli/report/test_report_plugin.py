@@ -47,9 +47,7 @@ def example():
 
 
 @pytest.fixture
-def drive(tmp_path, monkeypatch):
-    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
-    monkeypatch.setenv("COSMOS_RUNS", str(tmp_path / "runs"))
+def drive(own_places, tmp_path):
     (tmp_path / "rover.py").write_text(DESCRIPTOR)
     (tmp_path / "figures.py").write_text(example())
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from madns_runtime.analysis.matching import Matched, match
-from madns_runtime.analysis.sampling import as_array
+from madns_runtime.analysis.sampling import as_rows
 from madns_runtime.analysis.tables import ComparedRun
 from madns_runtime.analysis.values import Floats
 from madns_runtime.simulations.constellation.analysis.measurement_errors import rows_over_time
@@ -108,8 +108,8 @@ def total_attitude(found: Mapping[str, AttitudeDifference]) -> AttitudeDifferenc
 
 
 def _add(found: AttitudeDifference, piece: Matched) -> None:
-    q_a, q_b = (_columns(one.columns, QUATERNION) for one in (piece.a, piece.b))
-    w_a, w_b = (_columns(one.columns, RATES) for one in (piece.a, piece.b))
+    q_a, q_b = (as_rows(one.columns, QUATERNION) for one in (piece.a, piece.b))
+    w_a, w_b = (as_rows(one.columns, RATES) for one in (piece.a, piece.b))
     is_there = np.isfinite(q_a + q_b).all(axis=1) & np.isfinite(w_a + w_b).all(axis=1)
     if not is_there.any():
         return
@@ -142,7 +142,3 @@ def _angle_rad(q_a: Floats, q_b: Floats) -> Floats:
     vector = q_a[:, 3:] * q_b[:, :3] - q_b[:, 3:] * q_a[:, :3] - np.cross(q_a[:, :3], q_b[:, :3])
     angles: Floats = 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), np.abs(scalar))
     return angles
-
-
-def _columns(columns: Mapping[str, Any], names: tuple[str, ...]) -> Floats:
-    return np.column_stack([as_array(columns[name]) for name in names])

@@ -17,7 +17,7 @@ import numpy as np
 
 from madns_runtime.analysis.distribution import Summary
 from madns_runtime.analysis.matching import Matched, match
-from madns_runtime.analysis.sampling import BinnedRms, Stretch, as_array, evenly
+from madns_runtime.analysis.sampling import BinnedRms, Stretch, as_array, as_rows, evenly
 from madns_runtime.analysis.tables import ComparedRun, ComparedStream, Key
 from madns_runtime.analysis.values import Floats
 from madns_runtime.plain_values import mapping_at
@@ -202,8 +202,8 @@ def _add_positions(
     found: PositionDifference, piece: Matched, names: tuple[list[str], list[str]], spread: BinnedRms
 ) -> None:
     t_s = piece.a.keys
-    r_a, v_a = (_vectors(piece.a.columns, part) for part in names)
-    difference = _vectors(piece.b.columns, names[0]) - r_a
+    r_a, v_a = (as_rows(piece.a.columns, part) for part in names)
+    difference = as_rows(piece.b.columns, names[0]) - r_a
     is_there = np.isfinite(difference).all(axis=1) & np.isfinite(v_a).all(axis=1)
     if not is_there.any():
         return
@@ -233,10 +233,6 @@ def _slots_of(a: ComparedRun, b: ComparedRun) -> tuple[Slots, Slots]:
         for one, side, own_s in zip(tables, (a, b), (of_a, of_b), strict=True)
     )
     return slots_a, slots_b
-
-
-def _vectors(columns: Mapping[str, Any], names: list[str]) -> Floats:
-    return np.column_stack([as_array(columns[name]) for name in names])
 
 
 def _rtn(r_m: Floats, v_m_s: Floats) -> Floats:
@@ -329,7 +325,7 @@ def slot_errors_of(
 def _commanded(recorded: ComparedStream) -> list[float]:
     sizes: list[float] = []
     for columns in recorded.batches(("kind", "x", "y", "z")):
-        vectors = np.column_stack([as_array(columns[axis]) for axis in "xyz"])
+        vectors = as_rows(columns, "xyz")
         is_delta_v = columns["kind"].astype(str) == "delta_v"
         sizes.extend(np.linalg.norm(vectors[is_delta_v], axis=1).tolist())
     return sizes

@@ -17,7 +17,7 @@ import numpy as np
 
 from madns_runtime.analysis.lines import generic_blocks, grouped_lines
 from madns_runtime.analysis.matching import Rows, joined, match
-from madns_runtime.analysis.sampling import as_array
+from madns_runtime.analysis.sampling import as_array, as_rows
 from madns_runtime.analysis.tables import Columns, ComparedStream, Key, RecordedRun, RecordedTable
 from madns_runtime.analysis.values import Axis, Block, Floats, ReportRemark, TableBlock, headings
 from madns_runtime.recording.records import Field
@@ -76,8 +76,8 @@ class Quantity:
         Returns:
             Shape (N,): the difference's norm; of quaternions the angle between them, deg.
         """
-        first = np.column_stack([as_array(measured[name]) for name in self.names])
-        second = np.column_stack([as_array(truth[name]) for name in self.names])
+        first = as_rows(measured, self.names)
+        second = as_rows(truth, self.names)
         if self.names != QUATERNION:
             return np.asarray(np.linalg.norm(first - second, axis=1))
         # A quaternion and its negative are one attitude; small angles need the chord, not the cosine.

@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.analysis.lines import generic_blocks, grouped_lines
-from madns_runtime.analysis.sampling import evenly, thin_pieces, with_breaks
+from madns_runtime.analysis.sampling import (
+    evenly,
+    largest_size,
+    thin_pieces,
+    with_breaks,
+    with_gaps,
+)
 from madns_runtime.analysis.tables import RecordedRun, RecordedTable
 from madns_runtime.analysis.values import (
     Axis,
@@ -204,7 +210,7 @@ def _drift_table(
         cells: list[object] = [_satellite(run, agent)]
         for name, _ in wanted:
             values = numbers[name][index]
-            cells.append(_megajoules(values) if name == "energy_j_kg" else _worst(values))
+            cells.append(_megajoules(values) if name == "energy_j_kg" else largest_size(values))
         rows.append(cells)
     titles = [title for _, title in wanted]
     return TableBlock(
@@ -310,11 +316,6 @@ def _megajoules(values: Floats) -> str | None:
     return None if last is None else f"{last / 1e6:.6f}"
 
 
-def _worst(values: Floats) -> float | None:
-    finite = np.abs(values[np.isfinite(values)])
-    return float(finite.max()) if finite.size else None
-
-
 def orbit_figure(
     flown_km: Mapping[str, Floats], ellipses_km: Sequence[Floats], title: str
 ) -> SpaceFigure:
@@ -329,10 +330,10 @@ def orbit_figure(
     if len(flown_km) <= ONE_PATH_EACH_MAX:
         flown = [SpacePath(points=path, name=label) for label, path in flown_km.items()]
     else:
-        every = _with_gaps(list(flown_km.values()))
+        every = with_gaps(list(flown_km.values()))
         flown = [SpacePath(points=every, name="flown", tone="main")]
     ends = np.array([path[-1] for path in flown_km.values()])
-    whole = _with_gaps(ellipses_km)
+    whole = with_gaps(ellipses_km)
     return SpaceFigure(
         title=title,
         note="What was flown in colour, the orbit that it belongs to in grey, the Earth to scale. Drag to turn.",
@@ -360,8 +361,3 @@ def ellipse(r_km: Floats, v_km_s: Floats) -> Floats:
         np.cos(anomaly)[:, None] * towards + np.sin(anomaly)[:, None] * across
     )
     return orbit
-
-
-def _with_gaps(pieces: Sequence[Floats]) -> Floats:
-    gap = np.full((1, 3), np.nan)
-    return np.concatenate([part for piece in pieces for part in (piece, gap)])

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.analysis.sampling import as_array, evenly
+from madns_runtime.analysis.sampling import as_array, as_rows, evenly, largest_size
 from madns_runtime.analysis.tables import RecordedRun, RecordedTable, Tables
 from madns_runtime.analysis.values import Floats
 from madns_runtime.config import RunConfig
@@ -106,7 +106,7 @@ def read_control(
         ControlRow(
             t_s=t_s,
             slot_error_deg_rms=_rms(errors[:, index]),
-            slot_error_deg_max=_largest(errors[:, index]),
+            slot_error_deg_max=largest_size(errors[:, index]),
             satellites=int(np.isfinite(errors[:, index]).sum()),
             slot_error_estimated_deg_rms=None if believed is None else _rms(believed[:, index]),
             delta_v_m_s_mean=float(given[:, index].mean()),
@@ -247,7 +247,7 @@ def _mean_elements(
     for row, agent in enumerate(agents):
         columns = state.read(agent, ("t_s", *STATE))
         at_s = as_array(columns["t_s"])
-        states = np.stack([as_array(columns[name]) for name in STATE], axis=1)
+        states = as_rows(columns, STATE)
         for place, index in _at(at_s, times_s):
             x, y, z, vx, vy, vz = states[index].tolist()
             try:
@@ -316,11 +316,6 @@ def _messages(tables: Tables, times_s: Floats) -> NDArray[np.int64]:
 def _rms(values: Floats) -> float | None:
     finite = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else None
-
-
-def _largest(values: Floats) -> float | None:
-    finite = np.abs(values[np.isfinite(values)])
-    return float(finite.max()) if finite.size else None
 
 
 def _height_km(sma_m: Floats) -> float | None:

@@ -68,18 +68,6 @@ def normalised(q: Numbers) -> Quaternion:
     return x / length, y / length, z / length, w / length
 
 
-def to_matrix(q: Numbers) -> NDArray[np.float64]:
-    """Return the 3x3 matrix that takes inertial components to body components; *q* of unit length."""
-    x, y, z, w = (float(number) for number in q)
-    return np.array(
-        (
-            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)),
-            (2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)),
-            (2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)),
-        )
-    )
-
-
 def from_matrix(matrix: NDArray[np.float64]) -> Quaternion:
     """
     Return the quaternion, its scalar not negative, of a 3x3 rotation from inertial to body.
