@@ -41,6 +41,8 @@ Trace = dict[str, Any]
 """One trace as plotly.js takes it; numbers are numpy arrays until the page is written."""
 NAMES_SHOWN_MAX = 40
 NAMES_LEVEL_MAX = 6
+LONE_PX = 5
+"""Diameter of a value that no line goes to."""
 WHOLE_MAX = 6
 """Whole numbers up to this one each have a line: there is no half a tick."""
 HEIGHT_PX, BARS_HEIGHT_PX, SPACE_HEIGHT_PX = 300, 240, 560
@@ -222,6 +224,10 @@ def _(mark: Series, place: int, figure: Figure) -> list[Trace]:
         made["line"]["dash"] = "dot"
     if mark.form == "steps":
         made["line"]["shape"] = "hv"
+    if "points" not in mark.form and (is_lone := _lone(mark.y)).any():
+        # A line through one value alone has no length.
+        made["mode"] = "lines+markers"
+        made["marker"] = {"size": np.where(is_lone, LONE_PX, 0.0), "color": colour}
     if "points" in mark.form:
         made["marker"] = {"size": 5 if mark.form == "points" else 4, "color": colour}
         if (is_bad := _broken(figure, mark.x, mark.y)).any():
@@ -304,6 +310,12 @@ def _broken(figure: Figure, x: Floats, y: Floats) -> Any:
     for limit in figure.limits:
         is_bad |= limit.is_broken_by(x if limit.is_of_x else y)
     return is_bad
+
+
+def _lone(y: Floats) -> Any:
+    """Tell which values have none beside them, shape (N,)."""
+    is_there = np.pad(np.isfinite(y), 1)
+    return is_there[1:-1] & ~is_there[:-2] & ~is_there[2:]
 
 
 def _abscissae(mark: Mark) -> Floats:

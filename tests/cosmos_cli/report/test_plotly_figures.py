@@ -223,6 +223,22 @@ def test_numbers_of_any_size_are_drawn_without_a_word_of_our_source():
     assert page.count('class="plot"') == len(drawn)
 
 
+def test_value_between_two_gaps_is_drawn_as_a_point():
+    nan = np.nan
+    y = np.array([1.0, nan, 2.0, 3.0, nan, nan, 4.0])
+    made = to_plotly(figure(Series(x=np.arange(7.0), y=y), Series(x=X, y=X))).choices[0][1]
+
+    assert [trace["mode"] for trace in made] == ["lines+markers", "lines"]
+    assert (made[0]["marker"]["size"] > 0).tolist() == [True, *5 * [False], True]
+
+
+def test_single_value_is_drawn_as_a_point():
+    (trace,) = to_plotly(figure(Series(x=X[:1], y=X[:1], form="steps"))).choices[0][1]
+
+    assert trace["mode"] == "lines+markers"
+    assert (trace["marker"]["size"] > 0).tolist() == [True]
+
+
 def test_arrays_are_rows_of_a_table_and_columns_of_bars():
     whole = TableBlock(title="t", headings=headings("a", "b"), rows=np.array([[1, 2], [3, 4]]))
     single = TableBlock(title="t", headings=headings("a", "b"), rows=[np.array([1.5, 2.5])])
