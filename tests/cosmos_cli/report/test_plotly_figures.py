@@ -9,7 +9,7 @@ from test_report_browser import CHROMIUM, INSPECT, WATCH, browse
 
 from cosmos_cli.report.html import render_page
 from cosmos_cli.report.plotly_figures import to_plotly
-from cosmos_cli.report.style import BAD
+from cosmos_cli.report.style import BAD, log_axis
 from madns_runtime.analysis import values
 from madns_runtime.analysis.plain import from_plain, to_plain
 from madns_runtime.analysis.values import (
@@ -237,6 +237,20 @@ def test_single_value_is_drawn_as_a_point():
 
     assert trace["mode"] == "lines+markers"
     assert (trace["marker"]["size"] > 0).tolist() == [True]
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(62, 95), (500, 509), (110, 190), (2.1, 4.9), (0.031, 0.033), (6e4, 9.9e4)]
+)
+def test_logarithmic_axis_has_numbers_however_short_it_is(low, high):
+    ticks = log_axis(low, high)["tickvals"]
+
+    assert sum(low <= tick <= high for tick in ticks) >= 2
+
+
+@pytest.mark.parametrize(("low", "high"), [(5e-324, 1e-323), (7.0, 7.0), (5e-324, 1.7e308)])
+def test_logarithmic_axis_of_what_cannot_be_told_apart_is_one(low, high):
+    assert log_axis(low, high)["tickvals"]
 
 
 def test_arrays_are_rows_of_a_table_and_columns_of_bars():
