@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cosmos_cli.report.lettering import PLOT_PX, band_names, name_axis, names_px
 from cosmos_cli.report.plotly_space import space_layout, space_traces
 from cosmos_cli.report.style import (
     ACCENT,
@@ -40,7 +41,6 @@ from madns_runtime.analysis.values import (
 Trace = dict[str, Any]
 """One trace as plotly.js takes it; numbers are numpy arrays until the page is written."""
 NAMES_SHOWN_MAX = 40
-NAMES_LEVEL_MAX = 6
 LONE_PX = 5
 """Diameter of a value that no line goes to."""
 WHOLE_MAX = 6
@@ -98,8 +98,10 @@ def _plain(figure: Figure) -> tuple[dict[str, Any], int]:
     x = axis(figure.x.label, showgrid=False)
     if figure.x.is_logarithmic:
         x |= log_axis(*_positive_range(map(_abscissae, marks)))
+    height_px = HEIGHT_PX
     if bars:
-        x |= {"type": "category", "tickangle": -90}
+        x |= name_axis(_bar_names(bars), names_max=NAMES_SHOWN_MAX)
+        height_px = BARS_HEIGHT_PX + names_px(x, _bar_names(bars))
     layout = base_layout(xaxis=x, yaxis=_ordinate(figure.y, marks))
     if histograms:
         layout |= {"bargap": 0.05}
@@ -108,7 +110,7 @@ def _plain(figure: Figure) -> tuple[dict[str, Any], int]:
     if figure.is_to_scale:
         layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
     layout["shapes"] = _shapes(figure)
-    return layout, BARS_HEIGHT_PX if bars else HEIGHT_PX
+    return layout, height_px
 
 
 def _highest(bars: Sequence[Bars]) -> float:
@@ -138,31 +140,46 @@ def _grid(figure: Figure) -> tuple[dict[str, Any], int]:
         row_px=ROW_ALONE_PX if figure.columns == 1 else ROW_PX,
         x_title=figure.x.label,
     )
+    names_height_px = 0
     for index, panel in enumerate(figure.panels):
         number = index + 1
         inside = [mark for mark in marks if mark.panel == index]
         layout[f"yaxis{number}"] |= _ordinate(panel, inside) | {"title": {"text": ""}}
-        names = max((len(mark.names) for mark in inside if isinstance(mark, Bars)), default=0)
+        names = _bar_names([mark for mark in inside if isinstance(mark, Bars)])
         if names:
             # The charts stand in columns over the same names: the lowest one's serve all.
             is_lowest = number + figure.columns > count
-            layout[f"xaxis{number}"] |= {
-                "type": "category",
-                "showticklabels": is_lowest and names <= NAMES_SHOWN_MAX,
-                "tickangle": -90 if names > NAMES_LEVEL_MAX else 0,
-            }
+            level_px = 0.9 * PLOT_PX / figure.columns
+            x = name_axis(names, names_max=NAMES_SHOWN_MAX, level_px=level_px)
+            is_shown = is_lowest and len(names) <= NAMES_SHOWN_MAX
+            layout[f"xaxis{number}"] |= {**x, "showticklabels": is_shown}
+            if is_shown:
+                names_height_px = max(names_height_px, names_px(x, names))
             layout[f"yaxis{number}"] |= {"rangemode": "tozero"}
-    return layout, height_px
+    return layout, height_px + names_height_px
+
+
+def _bar_names(bars: Sequence[Bars]) -> list[str]:
+    return list(dict.fromkeys(name for mark in bars for name in mark.names))
+
+
+def _band_names(figure: Figure) -> list[str]:
+    """Return the name that is written at each of a figure's event bands; empty for none."""
+    edges = np.array([[event.start, event.end] for event in figure.events], dtype=np.float64)
+    drawn = np.concatenate([edges.ravel(), *map(_abscissae, _marks(figure))])
+    drawn = drawn[np.isfinite(drawn)]
+    low, high = (float(drawn.min()), float(drawn.max())) if len(drawn) else (0.0, 1.0)
+    return band_names(figure.events, low, high)
 
 
 def _shapes(figure: Figure) -> list[dict[str, Any]]:
     """Return what stands behind the marks of every choice: event bands, and limits that lie in what is drawn."""
     shapes: list[dict[str, Any]] = []
-    for event in figure.events:
+    for event, name in zip(figure.events, _band_names(figure), strict=True):
         place = {"yref": "paper", "x0": event.start, "x1": event.end, "y0": 0, "y1": 1}
         look = {"fillcolor": TONES.get(event.tone, MUTED), "opacity": 0.2, "line": {"width": 0}}
         shapes.append(
-            {"type": "rect", "layer": "below", **place, **look, **_label(event.name, "top left")}
+            {"type": "rect", "layer": "below", **place, **look, **_label(name, "top left")}
         )
     for limit in figure.limits:
         values = [(_abscissae if limit.is_of_x else _ordinates)(mark) for mark in _marks(figure)]

@@ -253,6 +253,43 @@ def test_logarithmic_axis_of_what_cannot_be_told_apart_is_one(low, high):
     assert log_axis(low, high)["tickvals"]
 
 
+def test_long_names_below_bars_stand_upright_and_short_ones_level():
+    def angle(*names):
+        made = figure(
+            Bars(names=names, values=[1.0] * len(names)),
+            x=Axis(),
+            panels=[Axis(quantity="mean"), Axis(quantity="max")],
+        )
+        return to_plotly(made).layout["xaxis1"]["tickangle"]
+
+    assert angle("agent-01", "agent-02", "agent-03") == 0
+    assert angle("agent-01", "agent-of-a-long-name-01", "agent-of-a-long-name-02") == -90
+    assert angle(*(f"agent-{number:02} (IRIDIUM 7)" for number in range(6))) == -90
+
+
+def test_upright_names_take_no_room_from_their_bars():
+    def height(name):
+        return to_plotly(figure(Bars(names=[name], values=[1.0]), x=Axis())).height_px
+
+    assert height("agent-01") == height("agent-02a")
+    assert height("agent-01 (A SATELLITE OF THIS NAME)") > height("agent-01") + 50
+
+
+def test_names_of_bands_that_would_lie_on_each_other_are_left_out():
+    long = "annotate text=something that happened here, again and again, and once more"
+    bands = [EventBand(start=t, end=t + 0.1, name=long) for t in np.arange(0.0, 60.0, 2.0)]
+    bands += [EventBand(start=70.0, end=75.0, name="kill")]
+    made = figure(Series(x=np.arange(100.0), y=np.ones(100)), events=bands)
+
+    shapes = to_plotly(made).layout["shapes"]
+    told = [shape["label"]["text"] for shape in shapes if "label" in shape]
+
+    assert len(shapes) == len(bands)
+    assert 2 <= len(told) <= 4
+    assert told[-1] == "kill"
+    assert all(len(text) <= 48 for text in told)
+
+
 def test_arrays_are_rows_of_a_table_and_columns_of_bars():
     whole = TableBlock(title="t", headings=headings("a", "b"), rows=np.array([[1, 2], [3, 4]]))
     single = TableBlock(title="t", headings=headings("a", "b"), rows=[np.array([1.5, 2.5])])
