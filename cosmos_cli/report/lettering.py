@@ -65,7 +65,7 @@ def names_px(axis: Mapping[str, Any], names: Sequence[str]) -> int:
     return max(0, round(longest - UPRIGHT_PX))
 
 
-def band_names(bands: Sequence[EventBand], low: float, high: float) -> list[str]:
+def band_names(bands: Sequence[EventBand], low: float, high: float, width_px: float) -> list[str]:
     """
     Return the name that is written at each band; empty where it would lie on another's.
 
@@ -75,10 +75,11 @@ def band_names(bands: Sequence[EventBand], low: float, high: float) -> list[str]
         bands: The bands.
         low: Least abscissa drawn.
         high: Largest abscissa drawn.
+        width_px: Width of what is drawn, px.
     """
     told = [""] * len(bands)
     taken: list[tuple[float, float]] = []
-    unit_px = PLOT_PX / max(high - low, 1e-300)
+    unit_px = width_px / max(high - low, 1e-300)
     order = sorted(range(len(bands)), key=lambda i: (bands[i].start - bands[i].end, i))
     for index in order:
         text = shortened(bands[index].name, BAND_CHARACTERS_MAX)

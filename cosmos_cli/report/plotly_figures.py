@@ -141,6 +141,7 @@ def _grid(figure: Figure) -> tuple[dict[str, Any], int]:
         x_title=figure.x.label,
     )
     names_height_px = 0
+    layout["shapes"] = []
     for index, panel in enumerate(figure.panels):
         number = index + 1
         inside = [mark for mark in marks if mark.panel == index]
@@ -156,6 +157,8 @@ def _grid(figure: Figure) -> tuple[dict[str, Any], int]:
             if is_shown:
                 names_height_px = max(names_height_px, names_px(x, names))
             layout[f"yaxis{number}"] |= {"rangemode": "tozero"}
+        else:  # names are no time
+            layout["shapes"] += _bands(figure, panel=index)
     return layout, height_px + names_height_px
 
 
@@ -169,18 +172,27 @@ def _band_names(figure: Figure) -> list[str]:
     drawn = np.concatenate([edges.ravel(), *map(_abscissae, _marks(figure))])
     drawn = drawn[np.isfinite(drawn)]
     low, high = (float(drawn.min()), float(drawn.max())) if len(drawn) else (0.0, 1.0)
-    return band_names(figure.events, low, high)
+    return band_names(figure.events, low, high, PLOT_PX / (figure.columns if figure.panels else 1))
+
+
+def _bands(figure: Figure, *, panel: int | None = None) -> list[dict[str, Any]]:
+    """Return the event bands behind a figure's marks or, in the *panel*-th, behind that panel's."""
+    number = panel + 1 if panel else ""
+    refs = (
+        {"yref": "paper"} if panel is None else {"xref": f"x{number}", "yref": f"y{number} domain"}
+    )
+    shapes = []
+    for event, name in zip(figure.events, _band_names(figure), strict=True):
+        place = {**refs, "x0": event.start, "x1": event.end, "y0": 0, "y1": 1}
+        look = {"fillcolor": TONES.get(event.tone, MUTED), "opacity": 0.2, "line": {"width": 0}}
+        label = {} if panel else _label(name, "top left")
+        shapes.append({"type": "rect", "layer": "below", **place, **look, **label})
+    return shapes
 
 
 def _shapes(figure: Figure) -> list[dict[str, Any]]:
     """Return what stands behind the marks of every choice: event bands, and limits that lie in what is drawn."""
-    shapes: list[dict[str, Any]] = []
-    for event, name in zip(figure.events, _band_names(figure), strict=True):
-        place = {"yref": "paper", "x0": event.start, "x1": event.end, "y0": 0, "y1": 1}
-        look = {"fillcolor": TONES.get(event.tone, MUTED), "opacity": 0.2, "line": {"width": 0}}
-        shapes.append(
-            {"type": "rect", "layer": "below", **place, **look, **_label(name, "top left")}
-        )
+    shapes = _bands(figure)
     for limit in figure.limits:
         values = [(_abscissae if limit.is_of_x else _ordinates)(mark) for mark in _marks(figure)]
         seen = np.concatenate([np.empty(0), *values])

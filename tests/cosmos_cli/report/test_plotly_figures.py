@@ -290,6 +290,23 @@ def test_names_of_bands_that_would_lie_on_each_other_are_left_out():
     assert all(len(text) <= 48 for text in told)
 
 
+def test_event_stands_behind_the_marks_of_every_panel_and_is_named_once():
+    made = figure(
+        Series(x=X, y=X),
+        Series(x=X, y=X, panel=1),
+        panels=[Axis(quantity="position"), Axis(quantity="velocity")],
+        events=[EventBand(start=1.0, end=2.0, name="red light")],
+    )
+
+    first, second = to_plotly(made).layout["shapes"]
+
+    assert (first["x0"], first["x1"]) == (second["x0"], second["x1"]) == (1.0, 2.0)
+    assert (first["xref"], first["yref"]) == ("x", "y domain")
+    assert (second["xref"], second["yref"]) == ("x2", "y2 domain")
+    assert first["label"]["text"] == "red light"
+    assert "label" not in second
+
+
 def test_arrays_are_rows_of_a_table_and_columns_of_bars():
     whole = TableBlock(title="t", headings=headings("a", "b"), rows=np.array([[1, 2], [3, 4]]))
     single = TableBlock(title="t", headings=headings("a", "b"), rows=[np.array([1.5, 2.5])])
