@@ -11,7 +11,7 @@ from typing import Any
 
 from madns_runtime.analysis.values import EventBand
 
-CHARACTER_PX = 6.2
+CHARACTER_PX = 5.5
 """Mean width of a character of 11 px, the size of all texts here."""
 PLOT_PX = 916
 """Width of what is drawn in a figure, without its margins, on a page of full width."""

@@ -263,7 +263,10 @@ def test_long_names_below_bars_stand_upright_and_short_ones_level():
         return to_plotly(made).layout["xaxis1"]["tickangle"]
 
     assert angle("agent-01", "agent-02", "agent-03") == 0
-    assert angle("agent-01", "agent-of-a-long-name-01", "agent-of-a-long-name-02") == -90
+    assert (
+        angle("agent-01", "an-agent-of-a-very-long-name-01", "an-agent-of-a-very-long-name-02")
+        == -90
+    )
     assert angle(*(f"agent-{number:02} (IRIDIUM 7)" for number in range(6))) == -90
 
 
@@ -288,6 +291,16 @@ def test_names_of_bands_that_would_lie_on_each_other_are_left_out():
     assert 2 <= len(told) <= 4
     assert told[-1] == "kill"
     assert all(len(text) <= 48 for text in told)
+
+
+def test_names_of_bands_beside_each_other_are_told_where_both_have_room():
+    drop, freeze = "device_fault device=gyro fault=drop value=1.0", "device_fault fault=freeze"
+    bands = [EventBand(start=3, end=6, name=drop), EventBand(start=6, end=8, name=freeze)]
+    made = figure(Series(x=np.arange(11.0), y=np.ones(11)), events=bands)
+
+    told = [shape["label"]["text"] for shape in to_plotly(made).layout["shapes"]]
+
+    assert told == [drop, freeze]
 
 
 def test_event_stands_behind_the_marks_of_every_panel_and_is_named_once():
