@@ -62,16 +62,17 @@ def check_replaceable(path: Path) -> None:
     See that a file may take the place of what a person named: root's would take that of /dev/null, for everybody.
 
     Raises:
-        OSError: There is a device, a pipe or a socket, or a link of the system to one, such as /dev/stdout.
+        OSError: There is a folder, a device, a pipe or a socket, or a link of the system to one, such as /dev/stdout.
     """
     try:
         mode = path.stat().st_mode
     except OSError:  # nothing is there, or nothing can be written there either
         mode = stat.S_IFREG
-    is_file = stat.S_ISREG(mode) or stat.S_ISDIR(mode)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a folder; name a file", str(path))
     folder = path.parent.resolve()
     is_systems = folder == Path("/dev") or folder.is_relative_to("/proc")
-    if not is_file or (is_systems and path.is_symlink()):
+    if not stat.S_ISREG(mode) or (is_systems and path.is_symlink()):
         why = "it is a device, a pipe or a stream, and no file; name a file"
         raise OSError(errno.EINVAL, why, str(path))
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 from cosmos_cli.bench.child_run import ChildRunOutcome, run_child
 from cosmos_cli.bench.search import CapacitySearch
 from cosmos_cli.errors import ExitCode
+from cosmos_cli.system.bounded_process import path_word
 from cosmos_cli.ui.console import Column
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import AGENTS_MAX
@@ -184,7 +185,7 @@ def find_capacity(
         )
         settings = [word for each in trials.overrides(agents) for word in ("--set", each)]
         outcome = run(
-            [str(scenario), "--no-report", *options, *settings],
+            [path_word(scenario), "--no-report", *options, *settings],
             limit_s=trials.seconds + RUN_LIMIT_S,
             is_quiet=True,
         )

@@ -12,6 +12,7 @@ from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.report.build import with_simulation
+from cosmos_cli.system.bounded_process import path_word
 from cosmos_cli.ui.console import Column, Console
 from madns_runtime.plain_values import mapping_at
 
@@ -194,7 +195,7 @@ def run_suite(
         console.say(f"{number} of {len(ordered)}: {scenario.path}, {duration_s:g} s")
         longest_s = scenario.run_config("bench").longest_s
         outcome = run_child(
-            [str(scenario.path), "--runs", str(runs), *options],
+            [path_word(scenario.path), "--runs", str(runs), *options],
             limit_s=longest_s + 600.0 + COLLECT_SHARE * duration_s,
             is_quiet=console.quiet,
         )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cosmos_cli.report.lettering import PLOT_PX, band_names, name_axis, names_px
 from cosmos_cli.report.plotly_space import space_layout, space_traces
 from cosmos_cli.report.style import (
     ACCENT,
@@ -40,7 +41,8 @@ from madns_runtime.analysis.values import (
 Trace = dict[str, Any]
 """One trace as plotly.js takes it; numbers are numpy arrays until the page is written."""
 NAMES_SHOWN_MAX = 40
-NAMES_LEVEL_MAX = 6
+LONE_PX = 5
+"""Diameter of a value that no line goes to."""
 WHOLE_MAX = 6
 """Whole numbers up to this one each have a line: there is no half a tick."""
 HEIGHT_PX, BARS_HEIGHT_PX, SPACE_HEIGHT_PX = 300, 240, 560
@@ -96,8 +98,10 @@ def _plain(figure: Figure) -> tuple[dict[str, Any], int]:
     x = axis(figure.x.label, showgrid=False)
     if figure.x.is_logarithmic:
         x |= log_axis(*_positive_range(map(_abscissae, marks)))
+    height_px = HEIGHT_PX
     if bars:
-        x |= {"type": "category", "tickangle": -90}
+        x |= name_axis(_bar_names(bars), names_max=NAMES_SHOWN_MAX)
+        height_px = BARS_HEIGHT_PX + names_px(x, _bar_names(bars))
     layout = base_layout(xaxis=x, yaxis=_ordinate(figure.y, marks))
     if histograms:
         layout |= {"bargap": 0.05}
@@ -106,7 +110,7 @@ def _plain(figure: Figure) -> tuple[dict[str, Any], int]:
     if figure.is_to_scale:
         layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
     layout["shapes"] = _shapes(figure)
-    return layout, BARS_HEIGHT_PX if bars else HEIGHT_PX
+    return layout, height_px
 
 
 def _highest(bars: Sequence[Bars]) -> float:
@@ -136,32 +140,59 @@ def _grid(figure: Figure) -> tuple[dict[str, Any], int]:
         row_px=ROW_ALONE_PX if figure.columns == 1 else ROW_PX,
         x_title=figure.x.label,
     )
+    names_height_px = 0
+    layout["shapes"] = []
     for index, panel in enumerate(figure.panels):
         number = index + 1
         inside = [mark for mark in marks if mark.panel == index]
         layout[f"yaxis{number}"] |= _ordinate(panel, inside) | {"title": {"text": ""}}
-        names = max((len(mark.names) for mark in inside if isinstance(mark, Bars)), default=0)
+        names = _bar_names([mark for mark in inside if isinstance(mark, Bars)])
         if names:
             # The charts stand in columns over the same names: the lowest one's serve all.
             is_lowest = number + figure.columns > count
-            layout[f"xaxis{number}"] |= {
-                "type": "category",
-                "showticklabels": is_lowest and names <= NAMES_SHOWN_MAX,
-                "tickangle": -90 if names > NAMES_LEVEL_MAX else 0,
-            }
+            level_px = 0.9 * PLOT_PX / figure.columns
+            x = name_axis(names, names_max=NAMES_SHOWN_MAX, level_px=level_px)
+            is_shown = is_lowest and len(names) <= NAMES_SHOWN_MAX
+            layout[f"xaxis{number}"] |= {**x, "showticklabels": is_shown}
+            if is_shown:
+                names_height_px = max(names_height_px, names_px(x, names))
             layout[f"yaxis{number}"] |= {"rangemode": "tozero"}
-    return layout, height_px
+        else:  # names are no time
+            layout["shapes"] += _bands(figure, panel=index)
+    return layout, height_px + names_height_px
+
+
+def _bar_names(bars: Sequence[Bars]) -> list[str]:
+    return list(dict.fromkeys(name for mark in bars for name in mark.names))
+
+
+def _band_names(figure: Figure) -> list[str]:
+    """Return the name that is written at each of a figure's event bands; empty for none."""
+    edges = np.array([[event.start, event.end] for event in figure.events], dtype=np.float64)
+    drawn = np.concatenate([edges.ravel(), *map(_abscissae, _marks(figure))])
+    drawn = drawn[np.isfinite(drawn)]
+    low, high = (float(drawn.min()), float(drawn.max())) if len(drawn) else (0.0, 1.0)
+    return band_names(figure.events, low, high, PLOT_PX / (figure.columns if figure.panels else 1))
+
+
+def _bands(figure: Figure, *, panel: int | None = None) -> list[dict[str, Any]]:
+    """Return the event bands behind a figure's marks or, in the *panel*-th, behind that panel's."""
+    number = panel + 1 if panel else ""
+    refs = (
+        {"yref": "paper"} if panel is None else {"xref": f"x{number}", "yref": f"y{number} domain"}
+    )
+    shapes = []
+    for event, name in zip(figure.events, _band_names(figure), strict=True):
+        place = {**refs, "x0": event.start, "x1": event.end, "y0": 0, "y1": 1}
+        look = {"fillcolor": TONES.get(event.tone, MUTED), "opacity": 0.2, "line": {"width": 0}}
+        label = {} if panel else _label(name, "top left")
+        shapes.append({"type": "rect", "layer": "below", **place, **look, **label})
+    return shapes
 
 
 def _shapes(figure: Figure) -> list[dict[str, Any]]:
     """Return what stands behind the marks of every choice: event bands, and limits that lie in what is drawn."""
-    shapes: list[dict[str, Any]] = []
-    for event in figure.events:
-        place = {"yref": "paper", "x0": event.start, "x1": event.end, "y0": 0, "y1": 1}
-        look = {"fillcolor": TONES.get(event.tone, MUTED), "opacity": 0.2, "line": {"width": 0}}
-        shapes.append(
-            {"type": "rect", "layer": "below", **place, **look, **_label(event.name, "top left")}
-        )
+    shapes = _bands(figure)
     for limit in figure.limits:
         values = [(_abscissae if limit.is_of_x else _ordinates)(mark) for mark in _marks(figure)]
         seen = np.concatenate([np.empty(0), *values])
@@ -222,6 +253,10 @@ def _(mark: Series, place: int, figure: Figure) -> list[Trace]:
         made["line"]["dash"] = "dot"
     if mark.form == "steps":
         made["line"]["shape"] = "hv"
+    if "points" not in mark.form and (is_lone := _lone(mark.y)).any():
+        # A line through one value alone has no length.
+        made["mode"] = "lines+markers"
+        made["marker"] = {"size": np.where(is_lone, LONE_PX, 0.0), "color": colour}
     if "points" in mark.form:
         made["marker"] = {"size": 5 if mark.form == "points" else 4, "color": colour}
         if (is_bad := _broken(figure, mark.x, mark.y)).any():
@@ -304,6 +339,12 @@ def _broken(figure: Figure, x: Floats, y: Floats) -> Any:
     for limit in figure.limits:
         is_bad |= limit.is_broken_by(x if limit.is_of_x else y)
     return is_bad
+
+
+def _lone(y: Floats) -> Any:
+    """Tell which values have none beside them, shape (N,)."""
+    is_there = np.pad(np.isfinite(y), 1)
+    return is_there[1:-1] & ~is_there[:-2] & ~is_there[2:]
 
 
 def _abscissae(mark: Mark) -> Floats:

@@ -68,14 +68,25 @@ def log_axis(low: float, high: float) -> dict[str, Any]:
     Return what makes an axis logarithmic.
 
     Ticks stand at 1, 2, 5 of each decade if there are few decades, else at 1; plotly's own would show
-    a 200 as a small 2.
+    a 200 as a small 2. Between values so close that fewer than two of those lie there they stand evenly.
     """
     first = math.floor(math.log10(max(low, 1e-12)))
     last = min(math.ceil(math.log10(max(high, 1e-12))), sys.float_info.max_10_exp)
     steps = (1, 2, 5) if last - first <= DECADES_FINE_MAX else (1,)
     ticks = [step * 10.0**decade for decade in range(first, last + 1) for step in steps]
     ticks = [tick for tick in ticks if tick < math.inf]
-    return {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
+    is_short = sum(low <= tick <= high for tick in ticks) < 2
+    if is_short and (high - low) / 2 > sys.float_info.min:
+        ticks = _even_ticks(low, high)
+    return {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:.10g}" for tick in ticks]}
+
+
+def _even_ticks(low: float, high: float) -> list[float]:
+    """Return round numbers between two that are less than three apart by their ratio, at least two of them."""
+    step = 10.0 ** math.floor(math.log10((high - low) / 2))
+    step *= next(factor for factor in (5, 2, 1) if factor * step <= (high - low) / 2)
+    first, last = math.ceil(low / step), math.floor(high / step)
+    return [number * step for number in range(first, last + 1)]
 
 
 def grid_layout(

@@ -45,11 +45,15 @@ def _print_section(console: Console, section: Section) -> None:
     if not told:
         return
     console.data(f"\n{section.title}")
+    if section.intro:
+        console.data(section.intro)
     for block in told:
         if isinstance(block, ReportRemark):
             console.data(block.text)
             continue
         console.data(f"\n{block.title}")
+        if block.note:  # such as how many rows there are beyond these
+            console.data(block.note)
         columns = [Column(h.text, is_number=h.is_number) for h in block.headings]
         console.table(columns, [[format_cell(cell) for cell in row] for row in block.rows])
 

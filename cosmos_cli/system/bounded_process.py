@@ -7,6 +7,13 @@ import os
 import signal
 import subprocess
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+
+def path_word(path: Path) -> str:
+    """Return a path as a word of a command line, where one that begins with a dash would be an option."""
+    text = str(path)
+    return f"./{text}" if text.startswith("-") else text
 
 
 def run_bounded(

@@ -12,6 +12,7 @@ from cosmos_cli.models.baseline import Baseline
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.models.scenario_outline import ScenarioOutline, with_seed
 from cosmos_cli.models.scenario_test import ExpectedOutcome, override_of
+from cosmos_cli.system.bounded_process import path_word
 from madns_runtime.bounded_files import real_path
 
 END_S: Final = 60.0
@@ -63,7 +64,7 @@ class SuiteCase:
     def arguments(self) -> list[str]:
         """Return the words behind `cosmos run`, with the seed even if it is the scenario's own."""
         settings = with_seed(self.overrides, self.seed)
-        return [str(self.path), *(word for item in settings for word in ("--set", item))]
+        return [path_word(self.path), *(word for item in settings for word in ("--set", item))]
 
     @property
     def repeat_command(self) -> str:

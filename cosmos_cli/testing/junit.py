@@ -118,8 +118,6 @@ def check_junit(path: Path | None) -> None:
         check_replaceable(path)
     except OSError as error:
         raise _unwritable(path, error.strerror) from error
-    if path.is_dir():
-        raise _unwritable(path, "it is a folder; name a file")
     if not os.access(path.parent, os.W_OK):
         raise _unwritable(path, f"no right to write in {path.parent}")
 

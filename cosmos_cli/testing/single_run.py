@@ -26,6 +26,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.tables import TableReader, open_tables
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.models.scenario_test import override_of
+from cosmos_cli.system.bounded_process import path_word
 from cosmos_cli.testing.case import deadline_of
 from cosmos_cli.testing.check_lines import broken_checks, check_line
 from cosmos_cli.testing.suite import FOLDER, POLL_S
@@ -119,7 +120,7 @@ def run(
     }
     overrides = [override_of(key, value) for key, value in chosen.items()]
     limit_s = deadline_of(load_scenario(path, overrides)) if deadline_s is None else deadline_s
-    words = [str(path), *(word for item in overrides for word in ("--set", item))]
+    words = [path_word(path), *(word for item in overrides for word in ("--set", item))]
     folder = runs_root() / FOLDER if runs is None else Path(runs)
     result = _finished(words, folder, limit_s)
     if result.is_too_long:

@@ -86,6 +86,14 @@ def test_devices_pipes_and_streams_are_no_place_for_a_file(tmp_path):
         check_replaceable(tmp_path / name)
 
 
+@pytest.mark.parametrize("name", ["", ".", "..", "/"])
+def test_folder_is_no_place_for_a_file(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+
+    with pytest.raises(IsADirectoryError, match="it is a folder; name a file"):
+        check_replaceable(Path(name))
+
+
 def test_link_that_is_laid_again_and_again_is_evaded(tmp_path, monkeypatch):
     """Between removing what is in the way and making the file, somebody lays the link anew."""
     victim = tmp_path / "victim"

@@ -128,6 +128,15 @@ def test_report_names_the_page_with_figures_only_where_it_is(made, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["", ".", "/"])  # "" as of a variable that is not set
+def test_report_takes_no_folders_place(made, capsys, name):
+    finish(made)
+
+    assert app.run(["report", "1", "--html", name]) == 2
+
+    assert "cannot be written: it is a folder; name a file" in capsys.readouterr().err
+
+
 def test_report_writes_html_where_it_is_told_to(made, tmp_path, capsys):
     finish(made)
     target = tmp_path / "here.html"

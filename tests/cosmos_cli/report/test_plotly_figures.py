@@ -9,7 +9,7 @@ from test_report_browser import CHROMIUM, INSPECT, WATCH, browse
 
 from cosmos_cli.report.html import render_page
 from cosmos_cli.report.plotly_figures import to_plotly
-from cosmos_cli.report.style import BAD
+from cosmos_cli.report.style import BAD, log_axis
 from madns_runtime.analysis import values
 from madns_runtime.analysis.plain import from_plain, to_plain
 from madns_runtime.analysis.values import (
@@ -221,6 +221,103 @@ def test_numbers_of_any_size_are_drawn_without_a_word_of_our_source():
 
     assert "The figure speed" not in page
     assert page.count('class="plot"') == len(drawn)
+
+
+def test_value_between_two_gaps_is_drawn_as_a_point():
+    nan = np.nan
+    y = np.array([1.0, nan, 2.0, 3.0, nan, nan, 4.0])
+    made = to_plotly(figure(Series(x=np.arange(7.0), y=y), Series(x=X, y=X))).choices[0][1]
+
+    assert [trace["mode"] for trace in made] == ["lines+markers", "lines"]
+    assert (made[0]["marker"]["size"] > 0).tolist() == [True, *5 * [False], True]
+
+
+def test_single_value_is_drawn_as_a_point():
+    (trace,) = to_plotly(figure(Series(x=X[:1], y=X[:1], form="steps"))).choices[0][1]
+
+    assert trace["mode"] == "lines+markers"
+    assert (trace["marker"]["size"] > 0).tolist() == [True]
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(62, 95), (500, 509), (110, 190), (2.1, 4.9), (0.031, 0.033), (6e4, 9.9e4)]
+)
+def test_logarithmic_axis_has_numbers_however_short_it_is(low, high):
+    ticks = log_axis(low, high)["tickvals"]
+
+    assert sum(low <= tick <= high for tick in ticks) >= 2
+
+
+@pytest.mark.parametrize(("low", "high"), [(5e-324, 1e-323), (7.0, 7.0), (5e-324, 1.7e308)])
+def test_logarithmic_axis_of_what_cannot_be_told_apart_is_one(low, high):
+    assert log_axis(low, high)["tickvals"]
+
+
+def test_long_names_below_bars_stand_upright_and_short_ones_level():
+    def angle(*names):
+        made = figure(
+            Bars(names=names, values=[1.0] * len(names)),
+            x=Axis(),
+            panels=[Axis(quantity="mean"), Axis(quantity="max")],
+        )
+        return to_plotly(made).layout["xaxis1"]["tickangle"]
+
+    assert angle("agent-01", "agent-02", "agent-03") == 0
+    assert (
+        angle("agent-01", "an-agent-of-a-very-long-name-01", "an-agent-of-a-very-long-name-02")
+        == -90
+    )
+    assert angle(*(f"agent-{number:02} (IRIDIUM 7)" for number in range(6))) == -90
+
+
+def test_upright_names_take_no_room_from_their_bars():
+    def height(name):
+        return to_plotly(figure(Bars(names=[name], values=[1.0]), x=Axis())).height_px
+
+    assert height("agent-01") == height("agent-02a")
+    assert height("agent-01 (A SATELLITE OF THIS NAME)") > height("agent-01") + 50
+
+
+def test_names_of_bands_that_would_lie_on_each_other_are_left_out():
+    long = "annotate text=something that happened here, again and again, and once more"
+    bands = [EventBand(start=t, end=t + 0.1, name=long) for t in np.arange(0.0, 60.0, 2.0)]
+    bands += [EventBand(start=70.0, end=75.0, name="kill")]
+    made = figure(Series(x=np.arange(100.0), y=np.ones(100)), events=bands)
+
+    shapes = to_plotly(made).layout["shapes"]
+    told = [shape["label"]["text"] for shape in shapes if "label" in shape]
+
+    assert len(shapes) == len(bands)
+    assert 2 <= len(told) <= 4
+    assert told[-1] == "kill"
+    assert all(len(text) <= 48 for text in told)
+
+
+def test_names_of_bands_beside_each_other_are_told_where_both_have_room():
+    drop, freeze = "device_fault device=gyro fault=drop value=1.0", "device_fault fault=freeze"
+    bands = [EventBand(start=3, end=6, name=drop), EventBand(start=6, end=8, name=freeze)]
+    made = figure(Series(x=np.arange(11.0), y=np.ones(11)), events=bands)
+
+    told = [shape["label"]["text"] for shape in to_plotly(made).layout["shapes"]]
+
+    assert told == [drop, freeze]
+
+
+def test_event_stands_behind_the_marks_of_every_panel_and_is_named_once():
+    made = figure(
+        Series(x=X, y=X),
+        Series(x=X, y=X, panel=1),
+        panels=[Axis(quantity="position"), Axis(quantity="velocity")],
+        events=[EventBand(start=1.0, end=2.0, name="red light")],
+    )
+
+    first, second = to_plotly(made).layout["shapes"]
+
+    assert (first["x0"], first["x1"]) == (second["x0"], second["x1"]) == (1.0, 2.0)
+    assert (first["xref"], first["yref"]) == ("x", "y domain")
+    assert (second["xref"], second["yref"]) == ("x2", "y2 domain")
+    assert first["label"]["text"] == "red light"
+    assert "label" not in second
 
 
 def test_arrays_are_rows_of_a_table_and_columns_of_bars():

@@ -156,6 +156,17 @@ def test_each_seed_is_a_test_with_its_own_settings(folder):
     assert cases[1].arguments()[1:] == ["--set", "time.duration_s=5", "--set", "seed=3"]
 
 
+def test_file_called_like_an_option_is_given_to_its_run_as_a_file(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "a.yaml").rename(folder / "--runs.yaml")
+
+    (case,) = chosen(find_scenarios([]), "alpha").cases
+
+    assert case.name == "--runs.yaml"
+    assert case.arguments()[0] == "./--runs.yaml"
+    assert case.repeat_command.startswith("cosmos run ./--runs.yaml ")
+
+
 def test_at_full_length_nothing_is_shortened_but_real_time(folder):
     settings = {"is_shortened": False, "realtime_s_max": 60.0}
     alpha, beta, _ = chosen(find_scenarios([folder]), **settings).cases
