@@ -5,7 +5,7 @@ Layout of COSMoS's folder on a machine: the one place that knows. Pure.
     <root>/environments/<key>/      virtual environments, by the hash of their lock; whole when `.complete` is there
     <root>/wheels/<sha256>/         wheels that environments were made from
     <root>/runs/<run>-<session>/    what a run records there, until it is collected
-    <root>/state/                   the register of processes, the lock, what was set and what it was before
+    <root>/state/                   the register of processes, the lock, what was set and what it was before, what is unchecked
 """
 
 from __future__ import annotations

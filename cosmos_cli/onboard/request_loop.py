@@ -257,10 +257,9 @@ def read_boot_id() -> str:
 
 def libc_version() -> str:
     """Return what the C library calls itself, such as "glibc 2.36"; empty where it does not say."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         return os.confstr("CS_GNU_LIBC_VERSION") or ""
-    except (OSError, ValueError):
-        return ""
+    return ""
 
 
 def serve(boot: list[str], package: bytes) -> None:
@@ -307,6 +306,19 @@ def _answer(header: dict[str, Any], body: bytes, out: BinaryIO) -> None:
     write_frame(out, {"ok": True, "value": value})
 
 
+_FULL = ("disk_full", "make room there, then repeat the command")
+_DENIED = ("step", "see who owns it (`ls -ld` there), or name another path in the inventory")
+CURES = {
+    errno.ENOSPC: _FULL,
+    errno.EDQUOT: _FULL,
+    errno.EROFS: ("read_only", "check the card or disk there (a worn SD card turns read-only)"),
+    errno.EACCES: _DENIED,
+    errno.EPERM: _DENIED,
+    errno.ENOTDIR: ("step", "remove what is no folder there, or name another path"),
+    errno.EIO: ("step", "the card or disk there fails: look at `dmesg` there, and replace it"),
+}
+
+
 def refusal_of(error: Exception) -> HelperRefusal:
     """Return an error as a refusal: one of the file system in words, one that nobody expected as a defect."""
     if isinstance(error, HelperRefusal):
@@ -314,14 +326,8 @@ def refusal_of(error: Exception) -> HelperRefusal:
     if not isinstance(error, OSError):
         return HelperRefusal("defect", f"unexpected {type(error).__name__}: {error}")
     where = f"{error.filename}: " if error.filename else ""
-    text = f"{where}{error.strerror or error}"
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return HelperRefusal("disk_full", text, "make room there, then repeat the command")
-    if error.errno == errno.EROFS:
-        return HelperRefusal(
-            "read_only", text, "check the card or disk there (a worn SD card turns read-only)"
-        )
-    return HelperRefusal("step", text)
+    kind, advice = CURES.get(error.errno or 0, ("step", ""))
+    return HelperRefusal(kind, f"{where}{error.strerror or error}", advice)
 
 
 def no_links(path: str, flags: int) -> int:
@@ -371,10 +377,8 @@ def lock(request: VerbRequest) -> None:
     except BlockingIOError:
         holder = os.read(descriptor, 200).decode(errors="replace").strip()
         os.close(descriptor)
-        by = f" ({holder})" if holder else ""
-        raise HelperRefusal(
-            "busy", f"another command works there{by}", "wait for its end, then repeat"
-        ) from None
+        text = "another command works there" + (f" ({holder})" if holder else "")
+        raise HelperRefusal("busy", text, "wait for its end, then repeat") from None
     os.ftruncate(descriptor, 0)
     os.write(descriptor, str(request.arguments.get("holder", "")).encode()[:200])
     PatientInput.patience_s = float(request.arguments.get("patience_s", LOCK_PATIENCE_S))
@@ -392,6 +396,5 @@ def _open_lock(path: str) -> int:
             raise
     if descriptor is not None:
         os.close(descriptor)
-    raise HelperRefusal(
-        "step", f"{path}: expected a file, got a link or something else", "delete it there"
-    )
+    text = f"{path}: expected a file, got a link or something else"
+    raise HelperRefusal("step", text, "delete it there")

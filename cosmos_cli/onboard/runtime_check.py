@@ -32,7 +32,7 @@ START_SCRIPT = """
 import sys
 import madns_runtime
 missing = [name for name in {modules!r} if not any(
-    finder.find_spec(name) for finder in sys.meta_path)]
+    finder.find_spec(name, None) for finder in sys.meta_path)]
 if missing:
     sys.exit("no module named " + ", ".join(missing))
 print(madns_runtime.__version__)

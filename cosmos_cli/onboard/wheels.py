@@ -154,7 +154,8 @@ class Archive:
         return list(self._entries), self._info
 
     def _check(self, file: io.BufferedReader) -> None:
-        infos = {n.partition("/")[0] for n in self._entries if ".dist-info/" in n}
+        tops = {name.partition("/")[0] for name in self._entries}
+        infos = {top for top in tops if top.endswith(".dist-info")}
         if infos != {self._info}:
             found = ", ".join(sorted(infos)) or "none"
             raise self._refusal(f"expected one folder {self._info}, got {found}")

@@ -18,6 +18,7 @@ from cosmos_cli.provision.trees import Tree
 from cosmos_cli.provision.wheelhouse import Environment
 
 MEMORY_FILE = "settings.json"
+UNCHECKED_FILE = "unchecked"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +61,11 @@ class DesiredState:
     def memory_path(self) -> str:
         """The file there that remembers what settings were before."""
         return f"{self.layout.state}/{MEMORY_FILE}"
+
+    @property
+    def unchecked_path(self) -> str:
+        """The file there that names what was installed and not yet seen to work."""
+        return f"{self.layout.state}/{UNCHECKED_FILE}"
 
     @property
     def distinct_environments(self) -> tuple[Environment, ...]:
@@ -141,6 +147,7 @@ def _files(desired: DesiredState, has_texts: bool) -> dict[str, str]:
     return {
         **dict.fromkeys(desired.directories, "look"),
         **dict.fromkeys((*setting_files(desired.paths), desired.memory_path), "text"),
+        desired.unchecked_path: "text",
         **{str(each.path): how for each in declared if each.content is not None},
         **{str(each.path): "text" for each in declared if each.content is None},
         **dict.fromkeys(boot, "text"),

@@ -22,6 +22,7 @@ import uv
 from packaging.specifiers import SpecifierSet
 from packaging.version import InvalidVersion, Version
 
+from cosmos_cli.cache import CACHE_VARIABLE
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision.lock import (
     DISTRIBUTION_PACKAGES,
@@ -43,6 +44,7 @@ NO_NETWORK = re.compile(
     r"|newconnectionerror|connecttimeout|readtimeout|temporary failure in name",
     re.IGNORECASE,
 )
+NO_ROOM = re.compile(r"no space left on device|disk quota exceeded", re.IGNORECASE)
 SECRET = re.compile(r"://[^/@\s]+@")
 EXTRA_INDEXES = ("UV_INDEX", "UV_EXTRA_INDEX_URL")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
@@ -91,6 +93,8 @@ def download(chosen: Sequence[Chosen], folder: Path, platform: Platform) -> None
         done = _run(command, timeout_s=DOWNLOAD_TIMEOUT_S, environment=pip_environment(os.environ))
     if done.returncode:
         names = ", ".join(each.locked.filename for each in chosen)
+        if NO_ROOM.search(done.stderr):
+            raise _no_room(done.stderr)
         if NO_NETWORK.search(done.stderr):
             raise _unreachable(done.stderr)
         raise MachineFailure(
@@ -224,6 +228,8 @@ def no_wheel(name: str, text: str, platform: Platform, *, pin: str = "") -> Mach
 
 
 def _resolve_failure(said: str, requirements: Sequence[str], platform: Platform) -> MachineFailure:
+    if NO_ROOM.search(said):
+        return _no_room(said)
     lacking = NO_WHEELS.search(" ".join(said.split()))
     if lacking:
         written = {normal_name(name): name for name in map(_name_of, requirements)}
@@ -235,6 +241,15 @@ def _resolve_failure(said: str, requirements: Sequence[str], platform: Platform)
         FailureKind.UNSUPPORTED,
         f"the requirements cannot be met for {platform.label}: {last_lines(said)}",
         "correct `requirements` in the scenario or cosmos_requirements in the inventory",
+    )
+
+
+def _no_room(said: str) -> MachineFailure:
+    line = next(line for line in said.splitlines() if NO_ROOM.search(line))
+    return MachineFailure(
+        FailureKind.DISK_FULL,
+        f"no room on this computer for what machines need: {last_lines(line.strip())}",
+        f"make room where that is, or name other folders with {CACHE_VARIABLE} (wheels), UV_CACHE_DIR and TMPDIR",
     )
 
 

@@ -41,9 +41,10 @@ from cosmos_cli.provision.gather_facts import (
     several,
 )
 from cosmos_cli.provision.resources import UpResources
-from cosmos_cli.provision.step import Done, Kind, Step
+from cosmos_cli.provision.step import Done, Kind, Step, StepRequest
 from cosmos_cli.provision.steps import check_possible, notes_of, plan_steps
 from cosmos_cli.provision.udp_echo import Echo
+from cosmos_cli.provision.unchecked import needs_check, note_unchecked, strike_out
 from cosmos_cli.provision.up_table import MachineResult
 from cosmos_cli.provision.up_view import MachineTeller, UpView
 from cosmos_cli.system.import_turn import IMPORT_TURN
@@ -110,13 +111,16 @@ class MachineUp:
         udp = self.resources.udp_question(self.connection, self.machine)
         checks = self._look(desired, also=self.resources.checks(desired, udp, depth="look"))
         steps = self._plan(desired)
-        if not steps:
+        is_doubtful = needs_check(self._facts, desired)
+        if steps and self.options.is_check:
+            self._foresee(desired, steps)
+        elif steps or (is_doubtful and not self.options.is_check):
+            self._change(desired)
+        else:
             check_possible(self._facts, steps)
             self._raise_first(checks, udp)
-        elif self.options.is_check:
-            self._foresee(desired, steps)
-        else:
-            self._change(desired)
+            if is_doubtful:
+                self._check(desired)
         self._note(desired)
         if not (steps and self.options.is_check) and desired.trees:
             check = Done(step=Step(kind=Kind.CHECK, title=CHECK_TITLE), changed=False)
@@ -148,6 +152,11 @@ class MachineUp:
             self._apply(desired, applier)
         finally:
             self.result.notes += applier.notes
+        self._check(desired)
+        self._ask(strike_out(self._facts, desired))
+
+    def _check(self, desired: DesiredState) -> None:
+        """See that what is wanted works there, in full on the first machine of its kind."""
         self.teller.detail("checking")
         udp = self.resources.udp_question(self.connection, self.machine)
         kind = machine_kind(self._facts, desired)
@@ -173,7 +182,12 @@ class MachineUp:
         steps = self._plan(desired)
         check_possible(self._facts, steps)
         self.result.planned = (*folders, *steps)
+        if steps:
+            self._ask(note_unchecked(self._facts, desired))
         applier.apply(steps)
+
+    def _ask(self, request: StepRequest) -> None:
+        self.board.call(request.verb, request.arguments, body=request.body)
 
     @property
     def _facts(self) -> MachineFacts:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:  # what plans is imported while machines are logged in at
 COLUMNS = (Column("machine"), Column("board"), Column("result"))
 FAILURE_CHARACTERS_MAX = 600
 """Of a failure in the table; --json has all of it."""
+FAILURE_BEGIN_CHARACTERS = 150
+"""Of one that is longer: which step it was. The end, which is a program's last words and what to do, has the rest."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -89,9 +91,10 @@ def result_of(outcome: Outcome[MachineResult | None]) -> MachineResult:
 
 def _one_line(text: str) -> str:
     line = " ".join(text.split())
-    return (
-        line if len(line) <= FAILURE_CHARACTERS_MAX else line[: FAILURE_CHARACTERS_MAX - 3] + "..."
-    )
+    if len(line) <= FAILURE_CHARACTERS_MAX:
+        return line
+    begin = line[:FAILURE_BEGIN_CHARACTERS] + " ... "
+    return begin + line[len(begin) - FAILURE_CHARACTERS_MAX :]
 
 
 def verdict(results: Sequence[MachineResult], *, is_check: bool, duration_s: float) -> str:

@@ -135,7 +135,7 @@ def requirements_of(path: Path) -> list[str]:
     """Return what a wheel says that it needs."""
     with zipfile.ZipFile(path) as wheel:
         for name in wheel.namelist():
-            if name.endswith(".dist-info/METADATA"):
+            if name.endswith(".dist-info/METADATA") and name.count("/") == 1:
                 metadata = HeaderParser().parsestr(wheel.read(name).decode())
                 return [str(text) for text in metadata.get_all("Requires-Dist", [])]
     return []

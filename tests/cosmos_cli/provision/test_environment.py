@@ -33,6 +33,7 @@ from cosmos_cli.provision.platform import greeted_platform
 from cosmos_cli.provision.sent_wheels import sent_wheel
 from cosmos_cli.provision.trees import runtime_tree, send_tree
 from cosmos_cli.provision.wheelhouse import prepare
+from cosmos_cli.provision.wheels import requirements_of
 
 pytestmark = pytest.mark.process
 
@@ -106,6 +107,38 @@ def sent(environment):
 
 def top_of(machine, environment):
     return Path(machine.layout.environment(environment.key))
+
+
+def test_start_bears_a_finder_that_asks_for_a_path(machine, house, tmp_path):
+    """As the one does that setuptools puts before all others."""
+    finder = (
+        b"class Finder:\n    def find_spec(self, name, path, target=None):\n        return None\n"
+    )
+    hack = {
+        "first.pth": b"import first",
+        "first.py": finder + b"import sys\nsys.meta_path.insert(0, Finder())\n",
+    }
+    environment = house.environment(make_wheel(tmp_path, "msgpack", "1.0", files=hack))
+    install(machine, environment)
+    runtime = runtime_tree()
+
+    with machine.board() as board:
+        send_tree(board, machine.layout, runtime)
+        check = RuntimeCheck(
+            key=environment.key, trees=[runtime.hash], depth="start", modules=["msgpack"]
+        )
+        told = started(board, machine.layout, check)
+
+    assert told["runtime"] == madns_runtime.__version__
+
+
+def test_wheel_that_brings_another_distribution_within_it_is_installed(machine, house, tmp_path):
+    inner = b"Metadata-Version: 2.1\nName: inner\nVersion: 3\nRequires-Dist: not-wanted\n"
+    vendored = {"setup_lib/_vendor/inner-3.dist-info/METADATA": inner}  # as setuptools does
+    wheel = make_wheel(tmp_path, "setup-lib", "1.0", files=vendored)
+
+    assert install(machine, house.environment(wheel))
+    assert requirements_of(wheel) == []
 
 
 def test_wheels_are_installed_as_the_specification_says(machine, house, navlib):

@@ -15,7 +15,7 @@ from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.models.provision_steps import FILE_BYTES_MAX
 from cosmos_cli.onboard import facts, files, request_loop, system, wheels
 from cosmos_cli.onboard.files import replace_file
-from cosmos_cli.onboard.request_loop import HelperRefusal, VerbRequest
+from cosmos_cli.onboard.request_loop import HelperRefusal, VerbRequest, refusal_of
 from cosmos_cli.provision import HELPER_PARTS
 
 PATIENCE_S = 30.0
@@ -134,6 +134,24 @@ def test_failure_at_any_point_leaves_the_old_file_alone(tmp_path, monkeypatch, f
 
     assert path.read_text() == "old"
     assert os.listdir(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("number", "kind", "cure"),
+    [
+        (errno.ENOSPC, "disk_full", "make room"),
+        (errno.EROFS, "read_only", "check the card"),
+        (errno.EACCES, "step", "who owns it"),
+        (errno.EPERM, "step", "who owns it"),
+        (errno.ENOTDIR, "step", "remove what is no folder"),
+        (errno.EIO, "step", "replace it"),
+    ],
+)
+def test_error_of_the_file_system_is_told_with_what_to_do(number, kind, cure):
+    refusal = refusal_of(OSError(number, os.strerror(number), "/home/pi/cosmos/trees"))
+
+    assert (refusal.kind, refusal.text) == (kind, f"/home/pi/cosmos/trees: {os.strerror(number)}")
+    assert cure in refusal.advice
 
 
 def test_nobody_sees_a_half_written_file(tmp_path, monkeypatch):

@@ -62,6 +62,19 @@ def test_long_failure_is_cut_in_the_table_and_whole_in_json():
     assert one.to_mapping()["failure"]["text"] == "x" * 5000
 
 
+def test_long_failure_keeps_its_step_its_last_words_and_what_to_do():
+    traceback = "  File x, in y\n" * 200
+    failure = MachineFailure(
+        FailureKind.STEP, f"command make: exit status 2:\n{traceback}OSError: no libusb", "install it"
+    )
+
+    shown = words(result("a", failure=failure))
+
+    assert shown.startswith("failed: command make: exit status 2: File x")
+    assert shown.endswith("File x, in y OSError: no libusb; install it")
+    assert len(shown) == len("failed: ") + up_table.FAILURE_CHARACTERS_MAX
+
+
 def test_verdict_counts_machines():
     results = [result("a"), result("b", steps=STEPS), result("c", failure=FAILURE)]
 

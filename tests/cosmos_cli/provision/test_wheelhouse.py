@@ -203,6 +203,40 @@ def test_full_disk_under_the_cache_is_told_as_this_computers_fault(index, monkey
         prepare(PI, [])
 
 
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        (
+            "uv",
+            "error: Failed to initialize cache at `/c`\n"
+            "  cause: failed to write to file `/c/CACHEDIR.TAG`: No space left on device (os error 28)",
+        ),
+        (
+            "pip",
+            "Traceback (most recent call last):\n  File a, in b\n"
+            "OSError: [Errno 28] No space left on device: '/c/a.whl'\n",
+        ),
+    ],
+)
+def test_program_that_finds_the_disk_of_this_computer_full_is_told_so(
+    index, monkeypatch, program, said
+):
+    run = resolver._run
+
+    def run_on_a_full_disk(command, **how):
+        is_full = ("download" in command) is (program == "pip")
+        return subprocess.CompletedProcess(command, 2, "", said) if is_full else run(command, **how)
+
+    monkeypatch.setattr(resolver, "_run", run_on_a_full_disk)
+    with pytest.raises(MachineFailure) as caught:
+        prepare(PI, [])
+
+    assert caught.value.kind is FailureKind.DISK_FULL
+    assert caught.value.text.startswith("no room on this computer")
+    assert caught.value.text.endswith(said.splitlines()[-1].strip())
+    assert "COSMOS_CACHE" in caught.value.advice
+
+
 def test_key_needs_no_wheels(index, no_process):
     first = prepare(PI, [])
     for wheel in first.lock:
