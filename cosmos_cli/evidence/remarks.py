@@ -21,9 +21,13 @@ from madns_runtime.config import from_mapping
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.medium.mailbox import HELD_MAX
 from madns_runtime.plugin.api import DeclaredStream
+from madns_runtime.protocol.link_settings import LinkLimits
+from madns_runtime.protocol.sending import MESSAGES_QUEUED_MAX
 from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field
 
 REMARKS_MAX = 20
+QUEUE_MIB = LinkLimits().send_queue_bytes_max // 2**20
+"""What may wait for one agent."""
 NOT_DECLARED = "not declared by the simulation's streams()"
 
 Declared = Mapping[tuple[str, str], DeclaredStream]
@@ -49,14 +53,20 @@ def result_remarks(
 
 
 def mailbox_remarks(account: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the remark on messages between agents that were delivered and dropped; none if there were none."""
-    count = mapping_at(account, "receivers").get("no_room")
-    if not is_number(count) or count <= 0:
-        return ()
-    return (
-        f"between agents: {counted(int(count), 'message')} found no room at their receivers, each of which holds"
-        f" {HELD_MAX} until their times: they were dropped, though delivered",
-    )
+    """Return the remarks on messages between agents that no medium lost and nobody received; none if there were none."""
+    no_room, unqueued = mapping_at(account, "receivers").get("no_room"), account.get("unqueued")
+    remarks = []
+    if is_number(no_room) and no_room > 0:
+        remarks.append(
+            f"between agents: {counted(int(no_room), 'message')} found no room at their receivers, each of which holds"
+            f" {HELD_MAX} until their times: they were dropped, though delivered"
+        )
+    if is_number(unqueued) and unqueued > 0:
+        remarks.append(
+            f"between agents: the queues to their receivers had no room for {counted(int(unqueued), 'message')}, as"
+            f" {QUEUE_MIB} MiB or {MESSAGES_QUEUED_MAX} messages waited in them: send less at once, or smaller ones"
+        )
+    return tuple(remarks)
 
 
 def malformed_check_remarks(summaries: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:

@@ -151,9 +151,11 @@ def _values(
 ) -> dict[str, Any]:
     """Return the scenario as plain values, without what is carried over."""
     config = recorded.config
-    agents = dataclasses.replace(config.agents, restarts_max=0)
+    agents, loss = config.agents, config.on_agent_loss
+    if not config.time.is_lockstep:  # there losses repeat, as all else does
+        agents = dataclasses.replace(agents, restarts_max=0)
+        loss = "continue" if carried.loses_agents else "abort"
     time = dataclasses.replace(config.time, mode="lockstep")
-    loss = "continue" if carried.loses_agents else "abort"
     if config.on_agent_loss != loss:
         remarks.append("on_agent_loss: abort, as its losses are not flown again")
     hardware = dataclasses.replace(config.hardware, use=(), devices=_devices(recorded, remarks))

@@ -67,7 +67,7 @@ class Carrier:
         self._now_s = now_s
         self._accounts: dict[str, MessageAccount] = {}
         self._serial = 0
-        self._untold = 0
+        self._untold = self._unqueued = 0
         # Bounded by senders, their queues and the receivers: a message waits at most for its queue.
         self._heap: list[tuple[float, str, int, int, str, Delivery, MessageAccount]] = []
 
@@ -145,6 +145,7 @@ class Carrier:
             "refusals_untold": self._untold,
             "in_flight": total["in_flight"],
             "undelivered": total["undelivered"],
+            "unqueued": self._unqueued,
             "known_late": total["heard_late"],
         }
 
@@ -177,6 +178,8 @@ class Carrier:
         try:
             return self._post(to, message)
         except (SendQueueFull, MessageTooLarge):
+            # The receiver is there: no loss of an agent explains this one.
+            self._unqueued += isinstance(message, Delivery)
             return False
 
 

@@ -1,7 +1,6 @@
 """Flight software in a rerun: what can be stepped flies, what is behind a device or was attached to is played back."""
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -30,13 +29,25 @@ FREE = {
 NAMES = (("agent-01", "star-1"),)
 
 
-def test_software_that_can_be_stepped_stays_as_it_is():
+def test_software_that_can_be_stepped_stays_as_it_is_and_is_told_results_as_in_real_time(tmp_path):
     given = parameters(flight=[{"command": ["cat"]}])
+    (tmp_path / "agents" / "agent-01").mkdir(parents=True)
+    (tmp_path / "agents" / "agent-01" / "ticks.jsonl").touch()
 
-    found = for_rerun(given, ("agent-01",), Path("runs/1"))
+    found = for_rerun(given, ("agent-01",), tmp_path)
 
-    assert found.parameters == replace(given, recorded_agents="runs/1/agents")
+    assert found.parameters == replace(given, recorded_agents=str(tmp_path / "agents"))
     assert found.remarks == ()
+
+
+def test_of_a_run_in_lockstep_results_are_told_as_they_come(tmp_path):
+    given = parameters(flight=[{"command": ["cat"]}])
+    again = replace(given, recorded_agents="runs/1/agents")  # it was a rerun itself
+
+    assert for_rerun(given, ("agent-01",), tmp_path).parameters == given
+    assert for_rerun(again, ("agent-01",), tmp_path).parameters == replace(
+        given, recorded_agents=str(tmp_path / "agents")
+    )
 
 
 def test_vehicles_that_command_nothing_have_no_recorded_results(tmp_path):

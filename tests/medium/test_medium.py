@@ -232,6 +232,7 @@ def test_every_message_is_accounted_whatever_becomes_of_it():
         "refusals_untold": 1,  # car-1 took no more; the kiosk is no agent
         "in_flight": 1,
         "undelivered": 2,
+        "unqueued": 1,  # car-3 was there and took no more; car-2 was lost
         "known_late": 0,
     }
     assert adds_up(account)

@@ -3,7 +3,8 @@ How a recorded run is flown again: software that can be stepped flies as it is t
 
 Of software behind a device the device's record has the bytes; of software that was only attached to, or has a clock of
 its own, the commands are on record. All software is told what became of its commands in the ticks in which it was told
-then: in lockstep it would hear of it a tick earlier, and all that it is sent would move with that.
+then: in lockstep it would hear of it a tick earlier, and all that it is sent would move with that. Of a run that was in
+lockstep itself it hears of it when it did, without a record.
 """
 
 from __future__ import annotations
@@ -46,13 +47,19 @@ def for_rerun(
         _played(rule, number, run_directory, remarks) for number, rule in enumerate(given)
     )
     flown = replace(parameters, flight=rules) if remarks else parameters
-    if given or any(vehicle.actuation for vehicle in parameters.vehicles):
+    is_told_by_record = parameters.recorded_agents is not None or _had_clock(run_directory, agents)
+    if is_told_by_record and (given or any(vehicle.actuation for vehicle in parameters.vehicles)):
         flown = replace(flown, recorded_agents=str(run_directory / "agents"))
     return Rerun(
         parameters=flown,
         remarks=tuple(remarks),
         unlike=(*UNLIKE, *_read_in_ticks(parameters)),
     )
+
+
+def _had_clock(run_directory: Path, agents: tuple[str, ...]) -> bool:
+    """Tell whether a run was in real time: in lockstep, where nobody is late, there is no stream of ticks."""
+    return any((run_directory / "agents" / name / "ticks.jsonl").is_file() for name in agents)
 
 
 def _read_in_ticks(parameters: ConstellationParameters) -> Iterator[str]:

@@ -29,6 +29,26 @@ def test_what_found_no_room_is_told_and_the_verdict_stays_what_it_is(tmp_path):
     assert remark.startswith("between agents: 3 messages found no room at their receivers")
 
 
-@pytest.mark.parametrize("account", [account_of(HELD_MAX), {}, {"receivers": {"no_room": "x"}}])
+def test_what_an_agent_that_was_there_took_no_more_of_is_told(tmp_path):
+    made = SyntheticRun(tmp_path).write()
+    account = account_of(5) | {"undelivered": 29, "unqueued": 29}
+
+    summary = finish_run(made.run, made.result() | {"between_agents": account}, made.expected)
+
+    (remark,) = summary.document["remarks"]
+    assert remark.startswith(
+        "between agents: the queues to their receivers had no room for 29 messages"
+    )
+
+
+@pytest.mark.parametrize(
+    "account",
+    [
+        account_of(HELD_MAX),
+        {},
+        {"receivers": {"no_room": "x"}, "unqueued": None},
+        {"undelivered": 3},
+    ],
+)
 def test_of_what_was_held_nothing_is_said(account):
     assert mailbox_remarks(account) == ()
