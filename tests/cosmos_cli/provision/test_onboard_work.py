@@ -1,5 +1,6 @@
 """What works on a machine changes files whole or not at all, and sees its commands through."""
 
+import errno
 import io
 import os
 import stat
