@@ -37,16 +37,14 @@ from cosmos_cli.evidence.arrow_values import (
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import DETAILS, Columns, RecordFile
 from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
-from madns_runtime.analysis.tables import RecordedRun
+from madns_runtime.analysis.tables import AGENT, INCARNATION, RecordedRun
+from madns_runtime.conditions.condition import TIME
 from madns_runtime.partial_file import create_partial
 from madns_runtime.recording.columns import joined_column
 from madns_runtime.recording.records import Field
 
 ROWS_PER_GROUP = 128 * 1024
-INCARNATION = "incarnation"
 SIMULATED_UTC = "simulated_utc"
-TIME = "t_s"
-AGENT = "agent"
 METADATA_KEY = b"cosmos"
 NO_LABELS = TableLabels()
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from cosmos_cli.launch.busiest_interval import Sending, busiest_interval
+from cosmos_cli.launch.busiest_interval import ROUNDING, Sending, busiest_interval
 from madns_runtime.plugin.api import Demand
 from madns_runtime.protocol.datagram import FRAGMENT_BYTES_MAX, FRAME_BYTES, OVERHEAD_BYTES
 
@@ -25,8 +25,6 @@ IP_UDP_BYTES = 28
 BITS_PER_BYTE = 8
 COUNT_MAX = 2.0**53
 """Of agents: above, a number and the next one are the same, and nobody has as many."""
-ROUNDING = 1e-9
-"""Sides that differ by a smaller share are equal: 3 x 0.1 s are 0.3 s, and 0.30000000000000004 in floats."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -312,7 +310,7 @@ def _first_beyond(left: Callable[[int], float], allowed: float) -> float:
 
 
 def is_within(used: float, allowed: float) -> bool:
-    """Tell whether the one is at most the other, but for ROUNDING; neither is negative."""
+    """Tell whether the one is at most the other, but for ROUNDING; neither is negative: 3 x 0.1 s are 0.3 s."""
     return used <= allowed * (1.0 + ROUNDING)
 
 

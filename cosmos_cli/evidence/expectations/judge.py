@@ -32,6 +32,7 @@ from cosmos_cli.evidence.expectations.records import Batch, RecordSource
 from cosmos_cli.evidence.expectations.seen_words import SeenWords
 from cosmos_cli.evidence.expectations.strangers import Strangers
 from cosmos_cli.evidence.verdict import CheckResult
+from cosmos_cli.models.check_rules import OF_NUMBERS, OF_TIMES
 from cosmos_cli.models.expectation import Expectation, HeldBounds, scaled
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY
 from madns_runtime.analysis.tables import Tables
@@ -43,8 +44,6 @@ _Earlier = tuple[str, Mapping[str, ExpectationOutcome]]
 """The stream of an expectation further up, and what its agents came to."""
 NOBODY = ""
 """Stands for the machines or devices that should have recorded a stream, and of which there is none."""
-OF_NUMBERS = ("count", "rate")
-OF_TIMES = ("first_time", "settled")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ import importlib.util
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 
 from madns_runtime.bounded_files import FileRefused, read_regular_file
@@ -30,6 +30,7 @@ from madns_runtime.simulations.constellation.equipment import (
     StarTrackerDevice,
     Vehicle,
 )
+from madns_runtime.simulations.constellation.orbit.earth import days_since_j2000
 from madns_runtime.simulations.constellation.orbit.magnetic import IGRF_14_DIPOLE_NT, decimal_year
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.sensor_channels import sensors_from_devices
@@ -41,7 +42,6 @@ WALL = tuple(f"{_HERE}.{part}" for part in ("truth", "vehicle", "host_side", "ho
 """Packages that flight software must not import: all that knows truth."""
 EVERYBODY = "*"
 """The glob of all vehicles."""
-J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
 FIELD_YEARS = {
     "dipole": (min(IGRF_14_DIPOLE_NT), max(IGRF_14_DIPOLE_NT)),
     "igrf": (1900.0, 2030.0),
@@ -194,7 +194,7 @@ def _field_models(vehicle: Vehicle) -> dict[str, str]:
 
 def field_year_remarks(parameters: ConstellationParameters, epoch_utc: datetime) -> list[str]:
     """Return a remark that the Earth's field at the epoch is that of another year: the models' coefficients end before."""
-    year = decimal_year((epoch_utc - J2000) / timedelta(days=1))
+    year = decimal_year(days_since_j2000(epoch_utc))
     for number, vehicle in enumerate(parameters.vehicles):
         models = {
             **_field_models(vehicle),

@@ -13,11 +13,13 @@ from madns_runtime.analysis.matching import Matched, match
 from madns_runtime.analysis.sampling import as_rows
 from madns_runtime.analysis.tables import ComparedRun
 from madns_runtime.analysis.values import Floats
-from madns_runtime.simulations.constellation.analysis.measurement_errors import rows_over_time
+from madns_runtime.simulations.constellation.analysis.measurement_errors import (
+    QUATERNION,
+    rows_over_time,
+)
 from madns_runtime.simulations.constellation.analysis.slots import TIME_S
 
 ATTITUDE = "attitude"
-QUATERNION = ("q1", "q2", "q3", "q4")
 RATES = ("wx_body_rad_s", "wy_body_rad_s", "wz_body_rad_s")
 
 
