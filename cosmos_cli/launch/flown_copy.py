@@ -118,7 +118,7 @@ def _found(folder: Path, left_out: list[str]) -> list[tuple[int, str, Path]]:
         name = path.relative_to(folder).as_posix()
         fault = fault_of_name(name)
         if fault:
-            left_out.append(f"{clean_line(name)}: {fault}")
+            left_out.append(f"{clean_line(name)} was left out for its name: {fault}")
             continue
         if len(found) == FILES_MAX:
             left_out.append(

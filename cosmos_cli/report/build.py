@@ -26,7 +26,7 @@ from cosmos_cli.report.timeline import (
     timeline_sections,
     with_bands,
 )
-from cosmos_cli.report.timing import clock_blocks, tick_blocks
+from cosmos_cli.report.timing import clock_blocks, reached_s, tick_blocks
 from madns_runtime.analysis import chapters
 from madns_runtime.analysis.chapters import Chapter
 from madns_runtime.analysis.lines import generic_blocks
@@ -79,9 +79,7 @@ def build_sections(run: RunDirectory, document: Mapping[str, Any]) -> list[Secti
     unknown = chapters.build_sections(others, recorded)
     actions = read_actions(run)
     note_agents_refusals(actions, recorded.tables.get("events"))
-    told = document.get("duration_s")
-    duration_s = float(told) if isinstance(told, int | float) else 0.0
-    found = with_bands((*before, *own, *unknown, *after), actions, duration_s)
+    found = with_bands((*before, *own, *unknown, *after), actions, reached_s(recorded))
     drawn_sections = [section for section in found if section.blocks]
     return [
         *_gaps(run, recorded),

@@ -9,6 +9,7 @@ import numpy as np
 from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.datagrams import whole_count
 from cosmos_cli.evidence.tick_causes import TOLD_CAUSES, WORDS, recorded_causes
+from cosmos_cli.report.timing import reached_s
 from madns_runtime.analysis.tables import RecordedRun, RecordedTable
 from madns_runtime.analysis.values import (
     Axis,
@@ -91,7 +92,7 @@ def _over_time(table: RecordedTable, run: RecordedRun, drawn: Sequence[str]) -> 
     columns = {name: table.read(name, ("missed", "cause")) for name in table.sources}
     times = {name: run.time_of(table, name)[0] for name in table.sources}
     end_s = max((float(t_s.max()) for t_s in times.values() if t_s.size), default=0.0)
-    edges = np.linspace(0.0, max(end_s, run.duration_s, 1e-9), TIME_BINS + 1)
+    edges = np.linspace(0.0, max(end_s, reached_s(run), 1e-9), TIME_BINS + 1)
     counts: dict[str, Floats] = {cause: np.zeros(TIME_BINS) for cause in (*drawn, OTHERS)}
     for name, of in columns.items():
         causes = of["cause"].astype(str)

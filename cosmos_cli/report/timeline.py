@@ -125,11 +125,11 @@ def _events(run: RunDirectory) -> Iterator[Mapping[str, Any]]:
 
 
 def with_bands(
-    sections: Sequence[Section], actions: Sequence[ActionTold], duration_s: float
+    sections: Sequence[Section], actions: Sequence[ActionTold], reached_s: float
 ) -> list[Section]:
-    """Return sections whose figures over simulated time show when actions were in force."""
+    """Return sections whose figures over simulated time, up to *reached_s*, show when actions were in force."""
     bands = [
-        EventBand(start=each.begin_s, end=_end_s(each, duration_s), name=each.what)
+        EventBand(start=each.begin_s, end=_end_s(each, reached_s), name=each.what)
         for each in actions
         if not each.refusal
     ][:BANDS_MAX]
@@ -182,9 +182,9 @@ def _note(count: int) -> str:
     return " ".join(texts)
 
 
-def _end_s(action: ActionTold, duration_s: float) -> float:
+def _end_s(action: ActionTold, reached_s: float) -> float:
     if action.end_s is not None:
         return action.end_s
     if action.lasts:
-        return max(duration_s, action.begin_s)
-    return action.begin_s + INSTANT_SHARE * duration_s
+        return max(reached_s, action.begin_s)
+    return action.begin_s + INSTANT_SHARE * reached_s

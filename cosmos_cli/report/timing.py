@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from cosmos_cli.evidence.statistics import TickStatistics, tick_statistics
@@ -40,6 +42,20 @@ def tick_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
         _missed(ticks),
         _tick_table(ticks),
     ]
+
+
+def reached_s(run: RecordedRun) -> float:
+    """
+    Return the simulated time that a run reached, s, at which figures over it end; 0 where nothing tells.
+
+    Of one whose host was killed no shutdown is on record: its last tick tells.
+    """
+    end_s = run.end_s if math.isfinite(run.end_s) else 0.0
+    ticks = run.tables.get("ticks")
+    if run.document.get("status") == "complete" or end_s < run.duration_s or ticks is None:
+        return end_s
+    times = (run.time_of(ticks, name)[0] for name in ticks.sources)
+    return min(end_s, max((float(t_s.max()) for t_s in times if t_s.size), default=end_s))
 
 
 def clock_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:

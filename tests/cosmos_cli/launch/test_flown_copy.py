@@ -68,6 +68,16 @@ def test_a_file_that_is_too_large_is_left_out_with_its_hash_and_named(folder, ru
     assert read_flown_files({"flown": flown.to_mapping()}) == flown
 
 
+def test_a_file_whose_name_cannot_be_listed_is_told_as_left_out(folder, run):
+    (folder / "a\x1b[31m.py").write_text("")
+
+    flown = copy_flown(folder, run, "private")
+
+    (told,) = flown_remarks({"flown": flown.to_mapping()})
+    assert told.startswith("flown: a\\x1b[31m.py was left out for its name: expected printable")
+    assert not flown.is_whole
+
+
 def test_of_too_much_the_smallest_are_copied(folder, run, monkeypatch):
     monkeypatch.setattr(flown_copy, "COPY_BYTES_MAX", 30)
     (folder / "data.bin").write_bytes(b"d" * 29)

@@ -6,7 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from harness.synthetic_run import SyntheticRun, make_config
 
+from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.report.build import build_sections
 from cosmos_cli.report.timeline import (
     note_agents_refusals,
     read_actions,
@@ -21,6 +24,7 @@ from madns_runtime.analysis.values import (
     Series,
     TableBlock,
 )
+from madns_runtime.recording.records import LATE_TICKS
 
 EVENTS = [
     {"t_s": 0.0, "event": "state", "state": "SIMULATION_START"},
@@ -86,6 +90,33 @@ def test_actions_are_rows_and_bands_in_figures_over_simulated_time_alone(tmp_pat
     assert [row[0] for row in table.rows] == [10.0, 40.0, 50.0]
     assert table.rows[0][2:5] == ["a, b", 30.0, 0.5]
     assert table.rows[2][-1] == "not there"
+
+
+@pytest.mark.parametrize("shutdown_s", [5.0, None])  # None: the host was killed, and told of no end
+def test_time_that_a_run_did_not_reach_is_in_no_figure(tmp_path, shutdown_s):
+    """Planned for 2000 s, ended after 5 s, while an action was in force."""
+    made = SyntheticRun(tmp_path / "runs", make_config(1, ticks=2000, tick_hz=1.0))
+    made.ticks = 6
+    made.write(shutdown_s=shutdown_s)
+    late = made.recorder("agents/agent-01", "agent-01", LATE_TICKS)
+    late.record("late_ticks", (3, 9000, 0, "wake_up"))
+    late.close()
+    finish_run(made.run, made.result(status="interrupted"), made.expected, has_report=False)
+    began = {"t_s": 1.0, "event": "action_began", "number": 0, "action": "slow", "lasts": True}
+    with (made.run.path / "host/events.jsonl").open("a") as events:
+        events.write(json.dumps(began) + "\n")
+
+    sections = build_sections(made.run, made.run.read_json(made.run.run_json))
+
+    blocks = {
+        block.title: block
+        for section in sections
+        for block in section.blocks
+        if isinstance(block, Figure)
+    }
+    (band,) = blocks["Lateness of the ticks over time"].events
+    assert (band.start, band.end) == (1.0, 5.0)
+    assert blocks["Missed and late ticks over time, by cause"].choices[0].marks[0].edges[-1] == 5.0
 
 
 class AgentEvents:
