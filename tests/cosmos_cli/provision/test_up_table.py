@@ -65,7 +65,9 @@ def test_long_failure_is_cut_in_the_table_and_whole_in_json():
 def test_long_failure_keeps_its_step_its_last_words_and_what_to_do():
     traceback = "  File x, in y\n" * 200
     failure = MachineFailure(
-        FailureKind.STEP, f"command make: exit status 2:\n{traceback}OSError: no libusb", "install it"
+        FailureKind.STEP,
+        f"command make: exit status 2:\n{traceback}OSError: no libusb",
+        "install it",
     )
 
     shown = words(result("a", failure=failure))
