@@ -44,6 +44,10 @@ LOCKSTEP_ENVIRONMENT: Mapping[str, str] = {"PYTHONHASHSEED": "0"}
 """The order of a set of names depends on it: with it, that is the same in every run."""
 STALL_S = 5.0
 """A turn of the loop that took this long means that the operator was stopped (Ctrl-Z), not its children."""
+STOOD_STILL = (
+    "this computer slept, or this command was stopped, for {stood_s:.0f} s; in real time who is silent for"
+    " timeouts.silence_s is lost: keep it awake, or let a board have the run (--detach --host MACHINE)"
+)
 SELECT_MAX_S = 1.0
 """A wake-up lost to a bug costs this long, not the run."""
 SELECT_MIN_S = 0.005  # while what is nearly due waits for a clock that stands
@@ -55,6 +59,9 @@ CLEAN_S = 3.0
 FORCED_S = 3.0
 """For what a lost machine's earlier life has left there."""
 NO_MACHINES: Mapping[str, RemoteMachine] = {}
+
+_boot_s = partial(time.clock_gettime, time.CLOCK_BOOTTIME)
+"""The time that goes on while the computer is suspended, s."""
 
 Child = LocalChild | RemoteChild
 """One started program, here or on another machine; none of its methods waits."""
@@ -150,7 +157,7 @@ class Operator:
     # The loop -------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        turned_s = self._now_s()
+        turned_s, turned_boot_s = self._now_s(), _boot_s()
         for key, mask in self._selector.select(self._wait_s(turned_s)):
             # An earlier callback of this round may have closed this one's descriptor.
             if self._selector.get_map().get(key.fd) is key:
@@ -161,6 +168,8 @@ class Operator:
         now_s = self._now_s()
         if now_s - turned_s > STALL_S:
             self._supervision.postpone(now_s - turned_s)
+        if not self._is_lockstep and (stood_s := _boot_s() - turned_boot_s) > STALL_S:
+            self._view.say(STOOD_STILL.format(stood_s=stood_s), "warning")
         self._carry_out(self._supervision.tick(now_s))
         self._handle_events()
 

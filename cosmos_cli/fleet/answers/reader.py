@@ -35,7 +35,7 @@ VALUES_MAX = 500_000
 """Of one line: every value takes some hundred times its bytes here."""
 SAID_BYTES_MAX = 60
 TALKS_ADVICE = (
-    "a shell start-up file there (.bashrc, .profile) that prints in sessions that are not interactive"
+    "a shell start-up file there (.bashrc, .profile, .ssh/rc) that prints in sessions that are not interactive"
     " must be silent"
 )
 

@@ -102,7 +102,7 @@ def test_start_up_file_that_talks_is_told(own_sshd, known_hosts):
         connection.close()
 
     assert caught.value.kind is FailureKind.DATA
-    assert "must be silent" in caught.value.advice
+    assert ".ssh/rc" in caught.value.advice and "must be silent" in caught.value.advice
 
 
 @pytest.mark.parametrize("ends", ["sleep 2; exit 1", "exec >&- 2>&-; sleep 2; exit 1"])

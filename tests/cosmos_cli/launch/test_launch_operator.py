@@ -181,6 +181,19 @@ def test_killed_host_is_reported_with_its_last_words_and_supervisors_are_stopped
     assert "stopped" in launched.notes
 
 
+def test_operator_that_was_stopped_says_so_and_what_it_costs(launched: Launched) -> None:
+    launched.start(host={"runs_s": 5}, constants={"operator.STALL_S": 1.5})
+    launched.wait_for_note("launched [")
+
+    launched.signal(signal.SIGSTOP)
+    time.sleep(1.6)
+    launched.signal(signal.SIGCONT)
+    launched.outcome()
+
+    assert "this computer slept, or this command was stopped, for " in launched.talk
+    assert "keep it awake" in launched.talk
+
+
 def test_workers_that_a_killed_host_leaves_in_its_group_are_killed(launched: Launched) -> None:
     launched.start(
         host={"killed_after_s": 0.2, "runs_s": 30, "leaves_worker": True},
