@@ -640,3 +640,13 @@ def test_file_that_cannot_be_looked_for_is_told_at_its_place(tmp_path, capsys, t
 def test_argument_that_no_file_can_be_called_is_bad_input(capsys, arguments):
     assert app.run(arguments) == 2
     assert "defect" not in capsys.readouterr().err
+
+
+def test_in_lockstep_agents_that_share_a_process_may_be_started_again(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        "name: a\nsimulation: counter\nagents: {count: 3, restarts_max: 2, per_process: 3}\n"
+        "on_agent_loss: continue\ntime: {mode: lockstep, duration_s: 5}\n"
+    )
+
+    assert load_scenario(path).scenario.agents.restarts_max == 2

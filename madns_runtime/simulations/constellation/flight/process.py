@@ -21,6 +21,7 @@ from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.simulations.constellation.flight.api import FlightContext, Readings
 from madns_runtime.simulations.constellation.flight.asked_ticks import AskedTick, AskedTicks
+from madns_runtime.simulations.constellation.flight.held_answers import held_answers
 from madns_runtime.simulations.constellation.flight.interface.answers import (
     FlightAnswer,
     carry_out,
@@ -71,7 +72,7 @@ class ExternalFlight:
     """Rest of that wait, s."""
 
     def __init__(self, settings: FlightProcess | FlightAttached, agent: AgentContext) -> None:
-        self._settings = settings
+        self._settings, self._held = settings, held_answers(agent)
         self._agent = agent
         self._is_lockstep = agent.is_lockstep
         interface = settings.interface
@@ -181,6 +182,8 @@ class ExternalFlight:
                 also: it does not answer in time.
         """
         try:
+            for answer, asked_s in self._held.take(t_s) if self._held else ():
+                carry_out(answer, self._context, self._link.name, t_s=asked_s)
             self._take_answers(t_s)
             self._send(t_s, readings)
             if self._is_lockstep and not self._is_played_back:
@@ -206,8 +209,7 @@ class ExternalFlight:
         if code:
             told = f"{self._link.name} ended with exit code {code}{self._last_words()}"
             self._context.log("warning", told)
-        counts = self._counts
-        summary: dict[str, Any] = dict(counts)
+        counts, summary = self._counts, dict[str, Any](self._counts)
         if self._link.program is not None:
             lines, size_bytes = self._link.program.talk_counts
             summary |= {"stderr_lines": lines, "stderr_bytes": size_bytes, "exit_code": code}
@@ -260,8 +262,7 @@ class ExternalFlight:
         summary |= {name: n for name, n in counts if n and name.startswith(lost)}
         if not self._is_lockstep:
             summary |= transport.counts
-            estimate = self._clock.estimate()
-            if estimate is not None:
+            if (estimate := self._clock.estimate()) is not None:
                 summary |= {
                     "clock_offset_s": round(estimate.offset_s, 9),
                     "clock_drift_ppm": round(estimate.drift_ppm, 3),
@@ -314,8 +315,7 @@ class ExternalFlight:
             self._record_clock(t_s)
 
     def _take(self, answer: FlightAnswer, came_s: float, t_s: float) -> None:
-        counts = self._counts
-        asked = None
+        counts, asked = self._counts, None
         if not self._has_own_clock:
             asked = self._find_asked(answer, came_s, t_s)
             if asked is None:
@@ -328,7 +328,10 @@ class ExternalFlight:
             counts["answers"] += 1
         if answer.board_us and self._is_recorded:
             self._clock.add(answer.board_us * 1e-6, self._agent.now_s() - (monotonic() - came_s))
-        carry_out(answer, self._context, self._link.name, t_s=asked.t_s if asked else None)
+        if self._held and asked and not self._is_played_back:
+            self._held.hold(answer, asked.t_s)
+        else:
+            carry_out(answer, self._context, self._link.name, t_s=asked.t_s if asked else None)
 
     def _find_asked(self, answer: FlightAnswer, came_s: float, t_s: float) -> AskedTick | None:
         """Return the tick that an answer is for, and forget it and those before; None for one to nothing."""
@@ -354,15 +357,13 @@ class ExternalFlight:
 
     def _record_answer(self, asked: AskedTick, came_s: float) -> None:
         sent_s, asked_s = asked
-        tick = round(asked_s * self._context.tick_hz)
-        answer_us = round((came_s - sent_s) * 1e6, 1)
+        tick, answer_us = round(asked_s * self._context.tick_hz), round((came_s - sent_s) * 1e6, 1)
         self._agent.record("flight_answers", (tick, asked_s, answer_us))
 
     def _record_clock(self, t_s: float) -> None:
         if t_s - self._clock_s < CLOCK_S:
             return
-        estimate = self._clock.estimate()
-        if estimate is not None:
+        if (estimate := self._clock.estimate()) is not None:
             self._clock_s = t_s
             row = (t_s, round(estimate.offset_s, 9), round(estimate.drift_ppm, 3))
             self._agent.record("flight_clock", row)
@@ -392,8 +393,8 @@ class ExternalFlight:
     def _last_words(self) -> str:
         """Return how much it said that was no packet, the last line of its standard error, and the file that holds it all."""
         line = self._link.program.last_line if self._link.program else ""
-        name = self._context.name
-        words = f"; its last words: {line!r} (agents/{name}/{STDERR_TEXT}.txt)" if line else ""
+        file = f"agents/{self._context.name}/{STDERR_TEXT}.txt"
+        words = f"; its last words: {line!r} ({file})" if line else ""
         rest = getattr(self._protocol, "rest", b"")
         cut = f"; it wrote {shown(rest)} without the end of a line" if rest else ""
         return told_faults(getattr(self._protocol, "faults", {})) + cut + words
