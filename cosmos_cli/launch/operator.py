@@ -60,7 +60,7 @@ FORCED_S = 3.0
 """For what a lost machine's earlier life has left there."""
 NO_MACHINES: Mapping[str, RemoteMachine] = {}
 
-_boot_s = partial(time.clock_gettime, time.CLOCK_BOOTTIME)
+_boot_s = partial(time.clock_gettime, getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 """The time that goes on while the computer is suspended, s."""
 
 Child = LocalChild | RemoteChild

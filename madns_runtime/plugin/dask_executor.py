@@ -45,11 +45,11 @@ class ClosingClient(Client):  # type: ignore[misc]  # distributed has no types
     """A client that leaves nothing behind if it does not come to be connected."""
 
     def start(self, **more: Any) -> None:
-        """Connect, or close, which the collector of garbage did in whatever thread it ran, and waited there."""
+        """Connect, or close: left to the collector of garbage, closing would hold whatever thread that runs in."""
         try:
             super().start(**more)
-        except BaseException:
-            with contextlib.suppress(Exception):
+        except BaseException:  # Ctrl-C too; it is raised again
+            with contextlib.suppress(Exception):  # the first failure is the one to tell
                 self.close(timeout=CLOSE_S)
             raise
 

@@ -479,7 +479,7 @@ frames = Frames(None)
 while 7 not in [number for number, *_ in frames.cut(os.read(0, 65536))]:  # the end of what a tick reports
     pass
 os.write(1, {told!r})
-time.sleep(60)
+time.sleep(60)  # until it is ended
 """)
     flight["command"] = [sys.executable, str(program)]
     ship = Ship(tmp_path, None, flight=flight)

@@ -186,7 +186,7 @@ def test_operator_that_was_stopped_says_so_and_what_it_costs(launched: Launched)
     launched.wait_for_note("launched [")
 
     launched.signal(signal.SIGSTOP)
-    time.sleep(1.6)
+    time.sleep(1.6)  # for longer than STALL_S
     launched.signal(signal.SIGCONT)
     launched.outcome()
 
