@@ -67,11 +67,19 @@ class EndedEarly(MachineFailure):
     """A program that ended by itself before it was told to; its kind is LOST."""
 
 
-def ended_early(said: str) -> EndedEarly:
-    """Return the failure of a program that ended before it was told to, with what it wrote to standard error."""
+def ended_early(said: str, exit_status: int | None) -> EndedEarly:
+    """
+    Return the failure of a program that ended before it was told to.
+
+    Args:
+        said: What it wrote to standard error.
+        exit_status: Negative for a signal; None when nobody knows.
+    """
     said = said.strip()
+    by_signal = f" (signal {-exit_status})" if exit_status is not None and exit_status < 0 else ""
     return EndedEarly(
-        FailureKind.LOST, "what worked there ended early" + (f": {said}" if said else "")
+        FailureKind.LOST,
+        f"what worked there ended early{by_signal}" + (f": {said}" if said else ""),
     )
 
 

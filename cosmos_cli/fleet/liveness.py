@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from cosmos_cli.fleet.connection import Connection, Stream
+from cosmos_cli.fleet.connection import Connection, Stream, StreamEnd
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.transfer_limits import Patience, duration_words, too_slow
 
@@ -20,6 +20,8 @@ NAMED_S = 2.0
 """After so long without a byte and a sign its silence is told: as soon as in a run."""
 SIGN_S = 8.0
 """For the sign to come: a board that is busy to the brim must not be taken for a dead one."""
+STATUS_WAIT_S = 1.0
+"""For the exit status of a program whose output has ended: it comes right after, if it comes."""
 
 
 class SilentMachine(MachineFailure):
@@ -112,9 +114,9 @@ class BlockingStream:
             if not count and self._is_silent():
                 raise SilentMachine
 
-    def errors(self) -> str:
-        """Return the last of what the program wrote to standard error."""
-        return self._stream.ending().errors
+    def ending(self) -> StreamEnd:
+        """Return how the program ended, waiting a moment for its status."""
+        return self._stream.ending(timeout_s=STATUS_WAIT_S)
 
     def _wait_s(self, left_s: float) -> float:
         return max(0.0, left_s if self._watch is None else min(SILENCE_S, left_s))

@@ -127,7 +127,8 @@ class LocalStream:
             wait_for(self._stdin.fileno(), select.POLLOUT, timeout_s)
             return os.write(self._stdin.fileno(), data)
         except (BrokenPipeError, ValueError):
-            raise ended_early(self.ending().errors) from None
+            end = self.ending()
+            raise ended_early(end.errors, end.exit_status) from None
 
     def close_writing(self) -> None:
         """End its standard input."""

@@ -371,7 +371,7 @@ def _reattach(machine: RemoteMachine, command: str, attach: bytes) -> tuple[Stre
                     if machine.has_started_anew():
                         raise MachineFailure(FailureKind.LOST, STARTED_ANEW)
                     return None
-                raise MachineFailure(FailureKind.LOST, f"no relay: {link.errors()}")
+                raise MachineFailure(FailureKind.LOST, f"no relay: {link.ending().errors}")
             said += data
         link.write_all(attach, timeout_s=RELAY_TIMEOUT_S)
     except BaseException:

@@ -129,7 +129,7 @@ def test_doctor_finds_what_is_wrong_with_each_board(care: Care) -> None:
 
 def test_doctor_finds_a_worn_card_and_a_bad_cable(care: Care) -> None:
     care.tower.fault("pi01", "ro")
-    care.tower.fault("pi02", "loss", 10)
+    care.tower.fault("pi02", "udploss", 10)
 
     code, answer = care.cosmos("doctor", "--limit", "pi01:pi02")
 

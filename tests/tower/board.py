@@ -83,6 +83,7 @@ class Condition:
 
     is_link_up: bool = True
     loss_percent: float = 0.0
+    is_loss_of_udp_alone: bool = False
     stays_off: bool = False
     is_reflashed: bool = False
     """A fresh card is put in before the next boot."""

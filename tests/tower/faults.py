@@ -67,12 +67,15 @@ def _set_link(scene: Scene, is_up: bool) -> None:
         scene.switch.set_link(scene.board.number, is_up=is_up)
 
 
-def _set_loss(scene: Scene, loss_percent: float) -> None:
+def _set_loss(scene: Scene, loss_percent: float, *, is_udp_alone: bool = False) -> None:
     if not 0 <= loss_percent <= 100:
         raise BoardError(f"loss: expected 0 to 100 percent, got {loss_percent:g}")
-    scene.board.condition.loss_percent = loss_percent
+    condition = scene.board.condition
+    condition.loss_percent, condition.is_loss_of_udp_alone = loss_percent, is_udp_alone
     if scene.board.supply is not None:
-        scene.switch.set_loss(scene.board.number, scene.board.supply, loss_percent)
+        scene.switch.set_loss(
+            scene.board.number, scene.board.supply, loss_percent, is_udp_alone=is_udp_alone
+        )
 
 
 # Power ------------------------------------------------------------------------------------------
@@ -251,6 +254,11 @@ FAULTS: dict[str, Fault] = {
     "up": Fault(act=lambda s: _set_link(s, True), text="plug the cable in again"),
     "loss": Fault(
         act=lambda s: _set_loss(s, s.number()), text="lose packets, each way", takes="PERCENT"
+    ),
+    "udploss": Fault(
+        act=lambda s: _set_loss(s, s.number(), is_udp_alone=True),
+        text="lose UDP datagrams, each way; a login cannot fail by it",
+        takes="PERCENT",
     ),
     "noloss": Fault(act=lambda s: _set_loss(s, 0), text="lose none"),
     "freeze": Fault(

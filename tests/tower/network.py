@@ -145,7 +145,9 @@ class Switch:
         """Pull a board's cable, or plug it in again."""
         self._batch(f"link set port{number} {'up' if is_up else 'down'}")
 
-    def set_loss(self, number: int, process: int, loss_percent: float) -> None:
+    def set_loss(
+        self, number: int, process: int, loss_percent: float, *, is_udp_alone: bool = False
+    ) -> None:
         """
         Lose this share of a board's packets, in each direction; 0 loses none.
 
@@ -156,17 +158,19 @@ class Switch:
             number: Of the board.
             process: One in its network namespace.
             loss_percent: 0 to 100.
+            is_udp_alone: Lose UDP datagrams and nothing else.
         """
         table = f"netdev port{number}"
         share = round(loss_percent * LOSS_SCALE / 100)
         drop = "drop" if share >= LOSS_SCALE else f"numgen random mod {LOSS_SCALE} < {share} drop"
+        of = "meta l4proto udp " if is_udp_alone else ""
         rules = [f"add table {table}", f"delete table {table}"]
         if loss_percent > 0:
             rules.append(f"add table {table}")
             for hook in ("ingress", "egress"):
                 chain = f"type filter hook {hook} device port{number} priority 0;"
                 rules.append(f"add chain {table} {hook} {{ {chain} }}")
-                rules.append(f"add rule {table} {hook} {drop}")
+                rules.append(f"add rule {table} {hook} {of}{drop}")
         (self._lossy.add if loss_percent > 0 else self._lossy.discard)(number)
         # One packet must be one packet: else bundles of 64 kB are lost or not. It costs speed.
         board = ["nsenter", f"--net=/proc/{process}/ns/net"]

@@ -136,7 +136,12 @@ class Supervisor:
             if not condition.is_link_up:
                 self._switch.set_link(board.number, is_up=False)
             if condition.loss_percent:
-                self._switch.set_loss(board.number, board.supply, condition.loss_percent)
+                self._switch.set_loss(
+                    board.number,
+                    board.supply,
+                    condition.loss_percent,
+                    is_udp_alone=condition.is_loss_of_udp_alone,
+                )
             self._selector.register(os.pidfd_open(board.supply), selectors.EVENT_READ, board)
             board.finish_boot()
 

@@ -95,11 +95,12 @@ def test_frozen_board_says_nothing_and_goes_on_after_thaw(tower8):
     assert answers(tower8, "pi02")
 
 
-def test_share_of_packets_is_lost_each_way_and_none_after(tower8):
+@pytest.mark.parametrize("fault", ["loss", "udploss"])
+def test_share_of_packets_is_lost_each_way_and_none_after(tower8, fault):
     echo = start(tower8, "pi03", f"exec python3 -uc '{ECHO}'")
     assert echo.stdout is not None and echo.stdout.readline() == "ready\n"
     try:
-        tower8.fault("pi03", "loss", LOSS_PERCENT)
+        tower8.fault("pi03", fault, LOSS_PERCENT)
         returned = count_echoes(tower8, "pi03")
         tower8.fault("pi03", "noloss")
         returned_after = count_echoes(tower8, "pi03")
@@ -110,6 +111,14 @@ def test_share_of_packets_is_lost_each_way_and_none_after(tower8):
     share = (1 - LOSS_PERCENT / 100) ** 2
     assert abs(returned / PACKETS - share) < 0.06  # five standard deviations
     assert returned_after == PACKETS
+
+
+def test_board_that_loses_every_datagram_still_lets_in(tower8):
+    tower8.fault("pi03", "udploss", 100)
+    try:
+        assert answers(tower8, "pi03")
+    finally:
+        tower8.fault("pi03", "noloss")
 
 
 def count_echoes(tower: Tower, name: str) -> int:

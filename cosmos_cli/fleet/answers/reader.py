@@ -133,7 +133,8 @@ class AnswerReader:
                 raise
             raise _too_late(patience, timeout_s) from None
         if not data:
-            raise ended_early(self._source.errors())
+            end = self._source.ending()
+            raise ended_early(end.errors, end.exit_status)
         patience.moved(len(data))
         self._buffer += data
 

@@ -62,6 +62,8 @@ class SshSocket:
         if isinstance(pipe, socket.socket) and pipe.family != socket.AF_UNIX:
             self._quick = pipe if hasattr(socket, "TCP_QUICKACK") else None
         self._stalled_since_s: float | None = None
+        self.breach: ConnectionAbortedError | None = None
+        """Why this side gave the machine up, if it did."""
         self._closed = False  # paramiko asks for a socket's own
         self.came_bytes = 0
         self.bytes_max: int | None = LOGIN_BYTES_MAX
@@ -77,7 +79,8 @@ class SshSocket:
             if self._stalled_since_s is None:
                 self._stalled_since_s = now_s
             elif now_s - self._stalled_since_s > SEND_STALL_S_MAX:
-                raise ConnectionAbortedError("it takes no more bytes") from None
+                self.breach = ConnectionAbortedError("it takes no more bytes")
+                raise self.breach from None
             raise
         self._stalled_since_s = None
         return count

@@ -175,4 +175,9 @@ class SshStream:
         return int(channel.exit_status)
 
     def _gone(self) -> MachineFailure:
-        return ended_early(self.ending().errors) if self._transport.is_active() else lost()
+        if (breach := self._transport.wire.breach) is not None:  # paramiko may not have noticed yet
+            return lost(breach)
+        if not self._transport.is_active():
+            return lost()
+        end = self.ending()
+        return ended_early(end.errors, end.exit_status)

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shutil
+import signal
 import subprocess
 import time
 
@@ -12,7 +13,9 @@ from sshd import Sshd
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.open_connection import connect
+from cosmos_cli.fleet.target import Target
 
 pytestmark = pytest.mark.process
 
@@ -51,6 +54,18 @@ def test_lock_is_held_by_one_until_it_ends(connection, tmp_path):
             except MachineFailure:
                 assert time.monotonic() < until_s, "the lock outlives its holder"
                 time.sleep(0.02)
+
+
+@pytest.mark.parametrize("is_here", [False, True])
+def test_signal_that_ends_it_is_told(connection, is_here):
+    local = LocalConnection(Target(name="here", address="127.0.0.1", connection="local"))
+    with Helper.start(local if is_here else connection) as board:
+        os.kill(board.greeting["pid"], signal.SIGKILL)
+        with pytest.raises(MachineFailure) as caught:
+            board.call("lock", {"path": "/nowhere"})
+
+    assert caught.value.kind is FailureKind.LOST
+    assert caught.value.text == f"what worked there ended early (signal {signal.SIGKILL.value})"
 
 
 def test_unknown_verb_is_refused_and_the_next_question_answered(connection, tmp_path):
