@@ -224,7 +224,7 @@ def test_board_that_returns_is_given_its_agents_again(tower: RunTower, fault: st
 
 def test_lost_packets_cost_no_message_that_must_arrive(tower: RunTower) -> None:
     for name in ("pi01", "pi02", "pi03"):
-        tower.tower.fault(name, "loss", 5)
+        tower.tower.fault(name, "udploss", 5)
     tower.start(time={"duration_s": 6, "rtf_tolerance": 0.9}, timeouts=PATIENT)
 
     code = tower.finish()
