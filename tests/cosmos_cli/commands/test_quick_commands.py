@@ -141,6 +141,24 @@ def test_schema_is_printed_written_and_checked(cosmos):
 
 
 @pytest.mark.process
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("schema", "--output", "-"),
+        ("schema", "--output", "-", "--check"),
+        ("test", "a.yaml", "--junit", "-"),
+        ("run", "a.yaml", "--junit", "-"),
+    ],
+)
+def test_dash_is_refused_in_place_of_a_file(cosmos, words):
+    code, _, err = cosmos(*words)
+
+    assert code == ExitCode.BAD_INPUT
+    assert "it is no file, and nothing goes to stdout; name a file" in err
+    assert not Path("-").exists()
+    assert not Path("runs").exists()
+
+
 def test_installed_simulations_that_do_not_load_are_left_out_of_the_schema_and_told(
     cosmos, tmp_path, monkeypatch
 ):
