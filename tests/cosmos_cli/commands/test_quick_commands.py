@@ -50,6 +50,16 @@ def test_validate_says_what_was_found(cosmos):
     )
 
 
+@pytest.mark.parametrize("words", [(), ("--resolved",)])
+def test_validate_keeps_a_file_with_a_line_end_in_its_name_on_one_line(cosmos, words):
+    Path("a\nb.yaml: ok.yaml").write_text(SCENARIO)
+
+    code, out, _ = cosmos("validate", *words, "a\nb.yaml: ok.yaml")
+
+    assert code == 0
+    assert "a\\nb.yaml: ok.yaml: ok: a, 3 agents" in out.splitlines()[0]
+
+
 def test_validate_shows_the_faults_of_all_files(cosmos):
     Path("b.yaml").write_text(SCENARIO + "sed: 1\n")
     Path("c.yaml").write_text(SCENARIO + "seed: -1\n")
