@@ -125,6 +125,11 @@ def test_each_panel_has_the_limits_of_its_own_and_those_of_the_abscissa():
         assert [colour == BAD for colour in colours] == [False, False, False, True, True]
 
 
+def test_limit_of_a_panel_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="no panel 2; it has 1"):
+        figure(LINE, limits=[LimitLine(value=1.0, panel=2)])
+
+
 def test_event_stands_behind_the_marks_over_the_whole_height():
     (event, _limit) = to_plotly(EVERY[0]).layout["shapes"]
 
@@ -187,10 +192,6 @@ def test_values_come_through_a_process_of_their_own_as_they_were():
         (lambda: figure(LINE, x="time"), "Figure.x: expected an Axis, got str"),
         (lambda: figure(LINE, events=None), "Figure.events: expected a list, got NoneType"),
         (lambda: figure(LINE, limits=[1.0]), r"limits\[0\]: expected LimitLine, got float"),
-        (
-            lambda: figure(LINE, limits=[LimitLine(value=1.0, panel=2)]),
-            "no panel 2; it has 1",
-        ),
         (lambda: figure(LINE, columns=0), "expected columns, got 0"),
         (lambda: Axis(quantity=3), "Axis.quantity: expected a text, got int"),
         (lambda: LimitLine(value=None), "LimitLine.value: expected a number, got None"),
