@@ -150,7 +150,6 @@ def test_schema_is_printed_written_and_checked(cosmos):
     assert err == "error: s.json: is not current; write it with: cosmos schema --output s.json\n"
 
 
-@pytest.mark.process
 @pytest.mark.parametrize(
     "words",
     [
@@ -169,6 +168,7 @@ def test_dash_is_refused_in_place_of_a_file(cosmos, words):
     assert not Path("runs").exists()
 
 
+@pytest.mark.process
 def test_installed_simulations_that_do_not_load_are_left_out_of_the_schema_and_told(
     cosmos, tmp_path, monkeypatch
 ):
