@@ -21,6 +21,8 @@ TRIES_MAX = 16
 FLAGS = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 MODE = 0o666
 """By the umask, as of any file."""
+STREAM_WORD = Path("-")
+"""What many programs take for stdout."""
 
 
 def create_partial(path: Path, *, takes_over: bool) -> tuple[Path, int]:
@@ -57,13 +59,26 @@ def remove_partial(path: Path) -> None:
         _plain_name(path).unlink()
 
 
+def refuse_stream_word(path: Path) -> None:
+    """
+    Refuse "-", which a person means as stdout: a file of that name would be hard to find, and to remove.
+
+    Raises:
+        OSError: It is that.
+    """
+    if path == STREAM_WORD:
+        raise OSError(errno.EINVAL, "it is no file, and nothing goes to stdout; name a file", "-")
+
+
 def check_replaceable(path: Path) -> None:
     """
     See that a file may take the place of what a person named: root's would take that of /dev/null, for everybody.
 
     Raises:
-        OSError: There is a folder, a device, a pipe or a socket, or a link of the system to one, such as /dev/stdout.
+        OSError: There is a folder, a device, a pipe or a socket, or a link of the system to one, such as /dev/stdout;
+            or it is "-".
     """
+    refuse_stream_word(path)
     try:
         mode = path.stat().st_mode
     except OSError:  # nothing is there, or nothing can be written there either

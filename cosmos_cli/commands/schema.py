@@ -21,6 +21,7 @@ from cosmos_cli.ui.console import Console
 from madns_runtime.bounded_files import read_regular_file
 from madns_runtime.config import Timeouts
 from madns_runtime.errors import MadnsError, PluginError
+from madns_runtime.partial_file import refuse_stream_word
 from madns_runtime.plugin.registry import is_shipped, registered_names, resolve
 
 SCHEMA_BYTES_MAX = 64 * 1024 * 1024
@@ -50,6 +51,7 @@ def schema(
         console.data(text.rstrip("\n"))
         return
     try:
+        refuse_stream_word(output)
         if check:
             _check(output, text)
         else:

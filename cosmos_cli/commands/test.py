@@ -26,6 +26,7 @@ from cosmos_cli.testing.terminal import (
     collected_line,
     details,
     failure_lines,
+    printed_name,
     summary_line,
 )
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
@@ -238,7 +239,7 @@ def _check_owners(cases: Sequence[SuiteCase]) -> None:
 
 
 def _run(console: Console, cases: Sequence[SuiteCase], options: SuiteOptions) -> SuiteResult:
-    width = max(len(case.name) for case in cases)
+    width = max(len(printed_name(case)) for case in cases)
     number = 0
 
     def tell(outcome: CaseOutcome) -> None:

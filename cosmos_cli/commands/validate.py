@@ -14,6 +14,7 @@ from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.models.resolved import origins, relative_root, resolved_lines
 from cosmos_cli.models.scenario_outline import check_test
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
+from cosmos_cli.ui.foreign_text import clean_line
 
 READERS = {
     "private": "",
@@ -50,11 +51,12 @@ def validate(
             found.append(scenario_file)
             for note in (*place_notes(scenario_file), *map(Fault.render, scenario_file.remarks)):
                 console.say(f"note: {note}")
+            name = clean_line(str(path), length_max=None)
             if resolved:
-                console.data(f"# {path}: ok: {_summary(scenario_file)}")
+                console.data(f"# {name}: ok: {_summary(scenario_file)}")
                 console.data("\n".join(resolved_lines(scenario_file)))
                 continue
-            console.data(f"{path}: ok: {_summary(scenario_file)}")
+            console.data(f"{name}: ok: {_summary(scenario_file)}")
     if faults:
         raise InputError(faults=faults, omitted=omitted)
     console.print_json(

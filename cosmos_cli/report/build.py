@@ -79,11 +79,12 @@ def build_sections(run: RunDirectory, document: Mapping[str, Any]) -> list[Secti
     unknown = chapters.build_sections(others, recorded)
     actions = read_actions(run)
     note_agents_refusals(actions, recorded.tables.get("events"))
-    found = with_bands((*before, *own, *unknown, *after), actions, reached_s(recorded))
+    expected = expectation_sections(run, recorded)
+    every = (*expected, *before, *own, *unknown, *after)
+    found = with_bands(every, actions, reached_s(recorded))
     drawn_sections = [section for section in found if section.blocks]
     return [
         *_gaps(run, recorded),
-        *with_second_names(expectation_sections(run, recorded), run_labels(run)),
         *with_second_names(drawn_sections, run_labels(run)),
         *timeline_sections(actions),
         *device_sections(document, recorded),

@@ -99,6 +99,7 @@ def _figure(
         x=x,
         y=Axis(unit=field.unit),
         limits=_limits(expectation, field.unit),
+        returns={name: recorded.returns(table, name) for name in series if name in table.sources},
     )
 
 

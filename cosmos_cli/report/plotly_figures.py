@@ -109,7 +109,7 @@ def _plain(figure: Figure) -> tuple[dict[str, Any], int]:
         layout["yaxis"] |= {"dtick": 1}
     if figure.is_to_scale:
         layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
-    layout["shapes"] = _shapes(figure)
+    layout["shapes"] = [*_bands(figure), *_limit_lines(figure)]
     return layout, height_px
 
 
@@ -159,6 +159,7 @@ def _grid(figure: Figure) -> tuple[dict[str, Any], int]:
             layout[f"yaxis{number}"] |= {"rangemode": "tozero"}
         else:  # names are no time
             layout["shapes"] += _bands(figure, panel=index)
+        layout["shapes"] += _limit_lines(figure, panel=index)
     return layout, height_px + names_height_px
 
 
@@ -190,19 +191,27 @@ def _bands(figure: Figure, *, panel: int | None = None) -> list[dict[str, Any]]:
     return shapes
 
 
-def _shapes(figure: Figure) -> list[dict[str, Any]]:
-    """Return what stands behind the marks of every choice: event bands, and limits that lie in what is drawn."""
-    shapes = _bands(figure)
+def _limit_lines(figure: Figure, *, panel: int | None = None) -> list[dict[str, Any]]:
+    """Return the limits that lie in what is drawn, in any choice: of a figure or, in the *panel*-th, of that panel."""
+    marks = [mark for mark in _marks(figure) if mark.panel == (panel or 0)]
+    number = panel + 1 if panel else ""
+    shapes = []
     for limit in figure.limits:
-        values = [(_abscissae if limit.is_of_x else _ordinates)(mark) for mark in _marks(figure)]
+        if not limit.is_of_x and limit.panel != (panel or 0):
+            continue
+        values = [(_abscissae if limit.is_of_x else _ordinates)(mark) for mark in marks]
         seen = np.concatenate([np.empty(0), *values])
         if not np.isfinite(seen).any() or not np.nanmin(seen) <= limit.value <= np.nanmax(seen):
             continue
         along, across = ("y", "x") if limit.is_of_x else ("x", "y")
-        place = {f"{along}ref": "paper", f"{along}0": 0, f"{along}1": 1}
+        ref = "paper" if panel is None else f"{along}{number} domain"
+        place = {f"{along}ref": ref, f"{along}0": 0, f"{along}1": 1}
         place |= {f"{across}0": limit.value, f"{across}1": limit.value}
+        if panel is not None:
+            place[f"{across}ref"] = f"{across}{number}"
         line = {"width": 1, "dash": "dot", "color": BAD}
-        shapes.append({"type": "line", **place, "line": line, **_label(limit.name, "end")})
+        name = "" if limit.is_of_x and panel else limit.name
+        shapes.append({"type": "line", **place, "line": line, **_label(name, "end")})
     return shapes
 
 
@@ -259,7 +268,7 @@ def _(mark: Series, place: int, figure: Figure) -> list[Trace]:
         made["marker"] = {"size": np.where(is_lone, LONE_PX, 0.0), "color": colour}
     if "points" in mark.form:
         made["marker"] = {"size": 5 if mark.form == "points" else 4, "color": colour}
-        if (is_bad := _broken(figure, mark.x, mark.y)).any():
+        if (is_bad := _broken(figure, mark.panel, mark.x, mark.y)).any():
             made["marker"]["color"] = np.where(is_bad, BAD, colour).tolist()
     if mark.note:
         made["hovertemplate"] = (
@@ -280,7 +289,7 @@ def _(mark: Band, place: int, figure: Figure) -> list[Trace]:
 def _(mark: Histogram, place: int, figure: Figure) -> list[Trace]:
     middles = (mark.edges[1:] + mark.edges[:-1]) / 2
     colour = _colour(mark.tone, place)
-    is_bad = _broken(figure, middles, mark.counts)
+    is_bad = _broken(figure, mark.panel, middles, mark.counts)
     unit = f" {figure.x.unit}" if figure.x.unit else ""
     told = "%{fullData.name}" if mark.name else figure.y.quantity
     return [
@@ -333,11 +342,12 @@ def _colour(tone: Tone, place: int) -> str:
     return PALETTE[place % len(PALETTE)]
 
 
-def _broken(figure: Figure, x: Floats, y: Floats) -> Any:
-    """Tell which points lie beyond a limit of the figure."""
+def _broken(figure: Figure, panel: int, x: Floats, y: Floats) -> Any:
+    """Tell which points of a panel lie beyond a limit."""
     is_bad = np.zeros(len(x), dtype=np.bool_)
     for limit in figure.limits:
-        is_bad |= limit.is_broken_by(x if limit.is_of_x else y)
+        if limit.is_of_x or limit.panel == panel:
+            is_bad |= limit.is_broken_by(x if limit.is_of_x else y)
     return is_bad
 
 

@@ -15,6 +15,7 @@ from cosmos_cli.evidence.timeline_remarks import told_events
 from madns_runtime.analysis.tables import RecordedTable
 from madns_runtime.analysis.values import (
     SIMULATED_TIME,
+    Block,
     EventBand,
     Figure,
     Heading,
@@ -23,6 +24,7 @@ from madns_runtime.analysis.values import (
 )
 from madns_runtime.bounded_files import open_regular_file
 from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED
+from madns_runtime.units import conversion
 
 BANDS_MAX: Final = 40
 ROWS_MAX: Final = 100
@@ -136,17 +138,20 @@ def with_bands(
     if not bands:
         return list(sections)
     return [
-        replace(
-            section,
-            blocks=[
-                replace(block, events=(*block.events, *bands))
-                if isinstance(block, Figure) and block.x == SIMULATED_TIME
-                else block
-                for block in section.blocks
-            ],
-        )
+        replace(section, blocks=[_with_bands(block, bands) for block in section.blocks])
         for section in sections
     ]
+
+
+def _with_bands(block: Block, bands_s: Sequence[EventBand]) -> Block:
+    """Return a figure over simulated time of whatever kind, in whatever unit, with bands; any other block as it is."""
+    if not isinstance(block, Figure) or not block.x.quantity.endswith(SIMULATED_TIME.quantity):
+        return block
+    factor = conversion(SIMULATED_TIME.unit, block.x.unit)
+    if factor is None or block.x.is_logarithmic:
+        return block
+    bands = [replace(band, start=band.start * factor, end=band.end * factor) for band in bands_s]
+    return replace(block, events=(*block.events, *bands))
 
 
 def timeline_sections(actions: Sequence[ActionTold]) -> list[Section]:

@@ -13,6 +13,7 @@ from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.models.scenario_outline import ScenarioOutline, with_seed
 from cosmos_cli.models.scenario_test import ExpectedOutcome, override_of
 from cosmos_cli.system.bounded_process import path_word
+from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.bounded_files import real_path
 
 END_S: Final = 60.0
@@ -68,8 +69,16 @@ class SuiteCase:
 
     @property
     def repeat_command(self) -> str:
-        """The command that repeats the run."""
-        return shlex.join(["cosmos", "run", *self.arguments()])
+        """The command that repeats the run, on one line."""
+        return " ".join(map(_shell_word, ["cosmos", "run", *self.arguments()]))
+
+
+def _shell_word(word: str) -> str:
+    """Return a word as a shell takes it; with control characters as escapes, which bash and zsh know in quotes."""
+    if clean_line(word, length_max=None) == word:
+        return shlex.quote(word)
+    shown = [each if clean_line(each) == each else f"\\U{ord(each):08x}" for each in word]
+    return "$'" + "".join(f"\\{each}" if each in "\\'" else each for each in shown) + "'"
 
 
 def make_cases(

@@ -5,19 +5,26 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 
+from cosmos_cli.testing.case import SuiteCase
 from cosmos_cli.testing.outcome import CaseOutcome
 from cosmos_cli.testing.suite import SuiteResult
+from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.plural import counted
 
 WIDTH = 79
 WORDS = {"passed": "PASSED", "failed": "FAILED", "interrupted": "INTERRUPTED"}
 
 
+def printed_name(case: SuiteCase) -> str:
+    """Return a test's name on one line: a file's may hold line ends, and words that would pass for a result."""
+    return clean_line(case.name, length_max=None)
+
+
 def case_line(outcome: CaseOutcome, *, number: int, total: int, width: int) -> str:
     """Return the line of one test: name, result, time, and how far the suite is."""
     share = f"[{100 * number // total:3d}%]"
     word = WORDS[outcome.outcome]
-    return f"{outcome.case.name:<{width}} {word:<11} {outcome.seconds:7.1f} s  {share}"
+    return f"{printed_name(outcome.case):<{width}} {word:<11} {outcome.seconds:7.1f} s  {share}"
 
 
 def failure_lines(outcomes: Sequence[CaseOutcome]) -> list[str]:
@@ -27,7 +34,7 @@ def failure_lines(outcomes: Sequence[CaseOutcome]) -> list[str]:
         return []
     lines = [_ruled("FAILURES", "=")]
     for each in failed:
-        lines += [_ruled(each.case.name, "_"), *details(each), ""]
+        lines += [_ruled(printed_name(each.case), "_"), *details(each), ""]
     return lines
 
 

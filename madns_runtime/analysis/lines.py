@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.analysis.sampling import points_per_series, thin_pieces
+from madns_runtime.analysis.breaks import NOWHERE
+from madns_runtime.analysis.sampling import drawn_series, points_per_series
 from madns_runtime.analysis.tables import AGENT, RecordedRun, RecordedTable
 from madns_runtime.analysis.values import (
     SIMULATED_TIME,
@@ -28,7 +29,6 @@ GROUP_SIZE = 5
 GROUP_RANGE = " … "
 """Between the first and the last name of a group."""
 FIGURES_MAX = 12
-NOWHERE: NDArray[np.int64] = np.empty(0, dtype=np.int64)
 TIME_FIELDS = ("t_s", "tick", "packet", "monotonic_s")
 
 
@@ -53,6 +53,8 @@ def grouped_lines(  # noqa: PLR0913 - what is drawn and how it is lettered; all 
     """
     Return one figure of a quantity of many, thinned; a remark if there is not a single value.
 
+    No line goes through a gap in samples that else come regularly, nor over an angle's wrap.
+
     Args:
         series: Abscissae and ordinates by whose they are.
         title: The figure's.
@@ -69,10 +71,14 @@ def grouped_lines(  # noqa: PLR0913 - what is drawn and how it is lettered; all 
     starts = returns or {}
     for label, names in groups_of_agents(tuple(series)):
         marks = [
-            Series(x=thinned[0], y=thinned[1], name=name, form=form)
+            drawn_series(
+                Series(x=series[name][0], y=series[name][1], name=name, form=form),
+                points,
+                unit=y.unit,
+                returns=starts.get(name, NOWHERE),
+            )
             for name in names
             if np.isfinite(series[name][1]).any()
-            for thinned in [thin_pieces(*series[name], starts.get(name, NOWHERE), points)]
         ]
         if marks:
             choices.append(FigureChoice(name=label, marks=marks))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.analysis.breaks import NOWHERE, gap_starts, wrap_starts
 from madns_runtime.analysis.values import Floats, Histogram, Series, Tone
 
 LEVELS = 240
@@ -17,6 +19,8 @@ QUANTILES = (0.5, 0.99)
 POINTS_PER_FIGURE = 40_000
 POINTS_PER_SERIES_MAX = 1500
 POINTS_PER_SERIES_MIN = 60
+POINTS_PER_WRAP = 6
+"""With fewer to each turn of an angle its lines are no more than strokes: points tell more."""
 RMS_BINS = 12
 """Stretches of time, unless it is said otherwise."""
 Stretch = tuple[float, float, float]
@@ -106,6 +110,31 @@ def thin_pieces(
     return with_breaks(joined[0], joined[1], heads)
 
 
+def drawn_series(
+    series: Series, points_max: int, *, unit: str = "", returns: NDArray[np.int64] = NOWHERE
+) -> Series:
+    """
+    Return a series as a figure shows it: thinned, its line broken at gaps, wraps and *returns*.
+
+    Args:
+        series: All samples, in the order of their abscissae. Steps hold over a gap.
+        points_max: Number of points that it may have, besides those of the breaks.
+        unit: Of its ordinates: angles wrap.
+        returns: Numbers of the samples with which one that was away goes on.
+    """
+    x, y = series.x, series.y
+    wraps = wrap_starts(y, unit)
+    if "points" not in series.form and POINTS_PER_WRAP * len(wraps) > points_max:
+        series = replace(series, form="points")
+    if series.form == "points":
+        x, y = thin(x, y, points_max)
+        return replace(series, x=x, y=y)
+    gaps = NOWHERE if series.form == "steps" else gap_starts(x, points_max)
+    starts = np.unique(np.concatenate((returns, gaps, wraps)))
+    x, y = thin_pieces(x, y, starts, points_max)
+    return replace(series, x=x, y=y)
+
+
 def evenly(count: int, points_max: int) -> NDArray[np.int64]:
     """Return indices of at most *points_max* of *count* samples, evenly spread, both ends included."""
     if count <= points_max:
@@ -163,7 +192,8 @@ def envelope_series(envelope: TimeEnvelope) -> list[Series]:
     """Return an envelope's curves, the largest behind, the median in front."""
     middles, curves = envelope.curves()
     tones: dict[str, Tone] = {"max": "pale", "p99": "warm", "p50": "main"}
-    return [Series(x=middles, y=curves[n], name=n, tone=tone) for n, tone in tones.items()]
+    marks = [Series(x=middles, y=curves[n], name=n, tone=tone) for n, tone in tones.items()]
+    return [drawn_series(mark, POINTS_PER_SERIES_MAX) for mark in marks]
 
 
 def _told(t_s: Floats, values: Floats) -> tuple[Floats, Floats]:

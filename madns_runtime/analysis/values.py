@@ -185,12 +185,14 @@ class LimitLine:
     is_least: bool = False
     """Whether smaller values are the bad ones."""
     is_of_x: bool = False
-    """Whether it is one of the abscissa."""
+    """Whether it is one of the abscissa, which all panels have in common."""
+    panel: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what is no number or no text."""
         hold_numbers(self, "value")
         hold_texts(self, "name")
+        hold_whole(self, "panel")
 
     def is_broken_by(self, values: Floats) -> NDArray[np.bool_]:
         """Tell which values lie beyond."""
@@ -270,7 +272,8 @@ class Figure:
                 f"figure {self.title!r}: expected a mark in each of at least one choice"
             )
         panels = max(len(self.panels), 1)
-        wrong = {m.panel for choice in self.choices for m in choice.marks} - set(range(panels))
+        inside = (*self.limits, *(mark for choice in self.choices for mark in choice.marks))
+        wrong = {each.panel for each in inside} - set(range(panels))
         if wrong:
             raise ValueError(f"figure {self.title!r}: no panel {min(wrong)}; it has {panels}")
 

@@ -86,6 +86,12 @@ def test_devices_pipes_and_streams_are_no_place_for_a_file(tmp_path):
         check_replaceable(tmp_path / name)
 
 
+def test_word_for_stdout_is_no_place_for_a_file(tmp_path):
+    with pytest.raises(OSError, match="nothing goes to stdout; name a file"):
+        check_replaceable(Path("-"))
+    check_replaceable(tmp_path / "-")
+
+
 @pytest.mark.parametrize("name", ["", ".", "..", "/"])
 def test_folder_is_no_place_for_a_file(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)

@@ -50,6 +50,16 @@ def test_validate_says_what_was_found(cosmos):
     )
 
 
+@pytest.mark.parametrize("words", [(), ("--resolved",)])
+def test_validate_keeps_a_file_with_a_line_end_in_its_name_on_one_line(cosmos, words):
+    Path("a\nb.yaml: ok.yaml").write_text(SCENARIO)
+
+    code, out, _ = cosmos("validate", *words, "a\nb.yaml: ok.yaml")
+
+    assert code == 0
+    assert "a\\nb.yaml: ok.yaml: ok: a, 3 agents" in out.splitlines()[0]
+
+
 def test_validate_shows_the_faults_of_all_files(cosmos):
     Path("b.yaml").write_text(SCENARIO + "sed: 1\n")
     Path("c.yaml").write_text(SCENARIO + "seed: -1\n")
@@ -138,6 +148,24 @@ def test_schema_is_printed_written_and_checked(cosmos):
 
     assert code == ExitCode.BAD_INPUT
     assert err == "error: s.json: is not current; write it with: cosmos schema --output s.json\n"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("schema", "--output", "-"),
+        ("schema", "--output", "-", "--check"),
+        ("test", "a.yaml", "--junit", "-"),
+        ("run", "a.yaml", "--junit", "-"),
+    ],
+)
+def test_dash_is_refused_in_place_of_a_file(cosmos, words):
+    code, _, err = cosmos(*words)
+
+    assert code == ExitCode.BAD_INPUT
+    assert "it is no file, and nothing goes to stdout; name a file" in err
+    assert not Path("-").exists()
+    assert not Path("runs").exists()
 
 
 @pytest.mark.process

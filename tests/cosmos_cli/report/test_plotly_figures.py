@@ -96,6 +96,40 @@ def test_what_lies_beyond_a_limit_is_drawn_as_bad_and_the_limit_where_it_is_seen
     assert far.choices[0][1][0]["marker"]["color"] != BAD
 
 
+def test_each_panel_has_the_limits_of_its_own_and_those_of_the_abscissa():
+    drawn = to_plotly(
+        figure(
+            Series(x=X, y=X, form="points"),
+            Series(x=X, y=10.0 * X, form="points", panel=1),
+            panels=[Axis(quantity="speed", unit="m/s"), Axis(quantity="gap", unit="m")],
+            limits=[
+                LimitLine(value=2.5, name="speed"),
+                LimitLine(value=25.0, name="gap", panel=1),
+                LimitLine(value=3.5, name="late", is_of_x=True),
+            ],
+        )
+    )
+
+    lines = {
+        (shape.get("label", {}).get("text"), shape["xref"], shape["yref"], shape["x0"], shape["y0"])
+        for shape in drawn.layout["shapes"]
+    }
+    assert lines == {
+        ("speed", "x domain", "y", 0, 2.5),
+        ("late", "x", "y domain", 3.5, 0),
+        ("gap", "x2 domain", "y2", 0, 25.0),
+        (None, "x2", "y2 domain", 3.5, 0),
+    }
+    for trace in drawn.choices[0][1]:
+        colours = trace["marker"]["color"]
+        assert [colour == BAD for colour in colours] == [False, False, False, True, True]
+
+
+def test_limit_of_a_panel_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="no panel 2; it has 1"):
+        figure(LINE, limits=[LimitLine(value=1.0, panel=2)])
+
+
 def test_event_stands_behind_the_marks_over_the_whole_height():
     (event, _limit) = to_plotly(EVERY[0]).layout["shapes"]
 

@@ -92,6 +92,43 @@ def test_actions_are_rows_and_bands_in_figures_over_simulated_time_alone(tmp_pat
     assert table.rows[2][-1] == "not there"
 
 
+@pytest.mark.parametrize(
+    ("x", "begin"),
+    [
+        (Axis(quantity="valid at simulated time", unit="s"), 10.0),
+        (Axis(quantity="simulated time", unit="h"), 10.0 / 3600.0),
+        (Axis(quantity="simulated time", unit="m"), None),
+        (Axis(quantity="simulated time", unit="s", is_logarithmic=True), None),
+        (Axis(quantity="time since the first sample", unit="s"), None),
+    ],
+)
+def test_bands_stand_where_the_action_was_on_every_axis_of_simulated_time(tmp_path, x, begin):
+    actions = read_actions(a_run(tmp_path, EVENTS))[:1]
+
+    (section,) = with_bands([Section(title="s", blocks=[a_figure(x=x)])], actions, 100.0)
+
+    bands = [(band.start, band.end) for band in section.blocks[0].events]
+    assert bands == ([] if begin is None else [(pytest.approx(begin), pytest.approx(3 * begin))])
+
+
+def test_figures_of_expectations_show_the_bands(tmp_path):
+    made = SyntheticRun(tmp_path, make_config(1)).write()
+    low = {"name": "low", "words": "max of ticks.lateness_us below 1", "stream": "ticks"}
+    low |= {"field": "lateness_us", "agents": ["agent-01"], "statistic": "max"}
+    low |= {"bounds": {"high": 1.0}, "unit": "us"}
+    plan = json.loads(made.run.plan_json.read_text())
+    made.run.plan_json.write_text(json.dumps({**plan, "expectations": [low]}))
+    with (made.run.path / "host" / "events.jsonl").open("a") as file:
+        file.writelines(json.dumps(event) + "\n" for event in EVENTS[1:3])
+    summary = finish_run(made.run, made.result(), made.expected)
+
+    sections = build_sections(made.run, summary.document)
+
+    (section,) = [one for one in sections if one.title == "Expectations"]
+    (figure,) = [block for block in section.blocks if isinstance(block, Figure)]
+    assert [(band.start, band.end) for band in figure.events] == [(10.0, 30.0)]
+
+
 @pytest.mark.parametrize("shutdown_s", [5.0, None])  # None: the host was killed, and told of no end
 def test_time_that_a_run_did_not_reach_is_in_no_figure(tmp_path, shutdown_s):
     """Planned for 2000 s, ended after 5 s, while an action was in force."""

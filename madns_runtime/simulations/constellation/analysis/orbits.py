@@ -9,11 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.analysis.breaks import gap_starts
 from madns_runtime.analysis.lines import generic_blocks, grouped_lines
 from madns_runtime.analysis.sampling import (
+    drawn_series,
     evenly,
     largest_size,
-    thin_pieces,
     with_breaks,
     with_gaps,
 )
@@ -121,8 +122,8 @@ def elements_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
             shown = values
             if field.name == NODE and np.isfinite(values).all():
                 shown = np.unwrap(values, period=360.0)  # it moves slowly, over 360 deg as well
-            x, y = thin_pieces(t_s, shown, returns, points)
-            marks.append(Series(x=x, y=y, panel=panel, tone="main"))
+            mark = Series(x=t_s, y=shown, panel=panel, tone="main")
+            marks.append(drawn_series(mark, points, unit=field.unit, returns=returns))
         choices.append(FigureChoice(name=_satellite(run, agent), marks=marks))
         rows.append([_satellite(run, agent), *(_last(values) for values in columns)])
     titles = [panel.label for panel in panels]
@@ -240,10 +241,11 @@ def _read_state(
     )
     chosen = _drawn(t_s, r_km, v_km_s, _points(len(table.sources)))
     # One that was away has no line through what it did not fly, least of all through the Earth.
-    returns = np.unique(np.searchsorted(chosen, run.returns(table, agent)))
-    returns = returns[(returns > 0) & (returns < len(chosen))]
-    _, r_km = with_breaks(t_s[chosen], r_km[chosen], returns)
-    t_s, v_km_s = with_breaks(t_s[chosen], v_km_s[chosen], returns)
+    returns = np.searchsorted(chosen, run.returns(table, agent))
+    starts = np.union1d(returns, gap_starts(t_s[chosen], len(chosen)))
+    starts = starts[(starts > 0) & (starts < len(chosen))]
+    _, r_km = with_breaks(t_s[chosen], r_km[chosen], starts)
+    t_s, v_km_s = with_breaks(t_s[chosen], v_km_s[chosen], starts)
     return t_s, r_km, v_km_s, _satellite(run, agent)
 
 
