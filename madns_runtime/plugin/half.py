@@ -244,7 +244,7 @@ class HostHalf(Half):
         """Takes what agents sent while faults are in force, and hands it on to `take_now`."""
         self._calls = calls or HostCalls()
         self._timer_s = self._stand_s = -math.inf
-        self._repeats = 0
+        self.repeats = 0  # of the timer at one simulated time
         self._make_medium = program.medium
         self._calls.name = getattr(program.make, "__name__", "")
         began_s = self._calls.begin("__init__")
@@ -361,10 +361,10 @@ class HostHalf(Half):
         """
         t_s = max(now_s if self.next_s is None else self.next_s, self._timer_s)
         if t_s - self._stand_s > STAND_S:
-            self._stand_s, self._repeats = t_s, 0
+            self._stand_s, self.repeats = t_s, 0
         else:
-            self._repeats += 1
-        if self._repeats > REPEATS_MAX:
+            self.repeats += 1
+        if self.repeats > REPEATS_MAX:
             raise HalfFailed(
                 f"{self.name}.timer asked {REPEATS_MAX} times in a row for t = {t_s:g} s: simulated time stands"
             )
