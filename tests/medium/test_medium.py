@@ -407,12 +407,29 @@ def test_numbers_and_texts_of_numpy_in_an_outcome_become_plain():
         ({"rate_byte_s": math.nan}, "rate_byte_s: expected"),
         ({"delay_s": 0.0}, "delay_s: expected seconds, more than 0, or a function"),
         ({"delay_s": "0.1"}, "delay_s: expected seconds"),
+        (
+            {"delay_s": lambda sender, receiver: 0.1},
+            r"delay_s: .* or a function of \(sender, receiver, t_s\), got .*<lambda>\(sender, receiver\)$",
+        ),
+        (
+            {"reach": lambda sender: None},
+            r"reach: expected None or a function of \(sender, receiver, t_s\), got .*<lambda>\(sender\)$",
+        ),
+        ({"reach": 1}, "reach: expected None or a function of .*, got 1$"),
         ({"queue_max": -1}, "queue_max: expected a whole number, 0 or more, got -1"),
     ],
 )
 def test_a_medium_that_cannot_be_is_refused_when_it_is_made(answers, told):
     with pytest.raises(PluginError, match=f"LinkMedium: {told}"):
         LinkMedium(NAMES, np.random.default_rng(1), **{"delay_s": 0.1, **answers})
+
+
+def test_functions_of_which_no_arguments_are_known_are_taken_as_they_are():
+    def near(*who, **rest):
+        return None
+
+    for reach in (near, dict, None):
+        medium(reach=reach)
 
 
 @pytest.mark.parametrize("answer", [True, False, 3, ""])
