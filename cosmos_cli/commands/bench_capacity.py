@@ -117,6 +117,10 @@ def capacity(
     console = Console(json=json, quiet=quiet, instead=f"the trials lie in {runs_root(runs)}")
     if first > largest:
         raise InputError(f"--first {first} is more than --largest {largest}")
+    if seconds < 1 / hz:
+        raise InputError(
+            f"--seconds {seconds:g} is less than one tick at --hz {hz:g}: give at least --seconds {1 / hz:g}"
+        )
     machines = some_machines(inventory, limit, host)
     trials = CapacityTrials(
         hz=hz,

@@ -146,10 +146,11 @@ class Operator:
             leftovers = self._let_go() if supervision.is_detached else self._clear_up()
             self._background.close(BACKGROUND_END_S)
             self._selector.close()
+        result = supervision.host_result or self._run.read_left_result()
         return LaunchOutcome(
-            host_result=supervision.host_result or self._run.read_left_result(),
+            host_result=result,
             interruption=supervision.interruption,
-            problems=self._reporter.problems,
+            problems=self._reporter.problems(result),
             leftovers=leftovers,
             is_detached=supervision.is_detached,
         )
@@ -169,7 +170,7 @@ class Operator:
         if now_s - turned_s > STALL_S:
             self._supervision.postpone(now_s - turned_s)
         if not self._is_lockstep and (stood_s := _boot_s() - turned_boot_s) > STALL_S:
-            self._view.say(STOOD_STILL.format(stood_s=stood_s), "warning")
+            self._reporter.stood_still(STOOD_STILL.format(stood_s=stood_s))
         self._carry_out(self._supervision.tick(now_s))
         self._handle_events()
 

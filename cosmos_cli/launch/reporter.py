@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from cosmos_cli.evidence.run_documents import Problem
 from cosmos_cli.launch.events import Logged, Noise, Progress, StateChanged
 from cosmos_cli.launch.request import View
@@ -9,6 +12,8 @@ from cosmos_cli.launch.request import View
 NOISE_LINES_MAX = 20
 """Lines of a child that are no events are shown this often, then only counted."""
 PROBLEMS_MAX = 200
+FAILED = ("failed", "aborted")
+"""Status of a run that did not come to its end."""
 
 Shown = StateChanged | Progress | Logged | Noise
 
@@ -24,12 +29,19 @@ class Reporter:
     def __init__(self, view: View) -> None:
         self._view = view
         self._problems: list[Problem] = []
+        self._stall = ""
         self._noise: dict[str, int] = {}
 
-    @property
-    def problems(self) -> tuple[Problem, ...]:
-        """Problems of the run, the first PROBLEMS_MAX."""
+    def problems(self, result: Mapping[str, Any] | None) -> tuple[Problem, ...]:
+        """Return the problems of the run, the first PROBLEMS_MAX; by the host's *result*, what may have ended it is one."""
+        if self._stall and (result is None or result.get("status") in FAILED):
+            return (*self._problems, Problem(text=self._stall))
         return tuple(self._problems)
+
+    def stood_still(self, text: str) -> None:
+        """Say that the operator stood still; a run that fails may have failed of that."""
+        self._stall = text
+        self._view.say(text, "warning")
 
     def problem(self, text: str, machine: str | None = None) -> None:
         """Say what did not go as it should, and keep it."""

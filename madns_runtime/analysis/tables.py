@@ -120,21 +120,42 @@ class RecordedRun:
 
     @property
     def end_s(self) -> float:
-        """Simulated time at which it ended, s: its duration if it was complete, else the begin of its shutdown."""
+        """
+        Simulated time at which it ended, s: its duration if it was complete, else the begin of its shutdown.
+
+        Of a host that was killed, and told none, the newest that an agent recorded.
+        """
         told = self.duration_s or math.inf
-        table = self.tables.get(HOST_EVENTS)
-        if self.document.get("status") == "complete" or not (
-            table is not None and table.has("t_s", "event", "details")
-        ):
+        if self.document.get("status") == "complete":
             return told
-        for _, columns in table.each(("t_s", "event", "details")):
-            is_state = columns["event"] == "state"
-            for t_s, details in zip(
-                as_array(columns["t_s"])[is_state], columns["details"][is_state], strict=True
-            ):
-                if any(state in str(details) for state in SHUTDOWN_STATES) and t_s < told:
-                    told = float(t_s)
-        return told
+        ended_s = min(self._shutdowns_s(), default=None)
+        return min(told, self._newest_s(told) if ended_s is None else ended_s)
+
+    def _shutdowns_s(self) -> list[float]:
+        """Return when the host told that the run ended, s."""
+        table = self.tables.get(HOST_EVENTS)
+        if table is None or not table.has("t_s", "event", "details"):
+            return []
+        return [
+            float(t_s)
+            for _, columns in table.each(("t_s", "event", "details"))
+            for t_s, event, details in zip(
+                as_array(columns["t_s"]), columns["event"], columns["details"], strict=True
+            )
+            if event == "state"
+            and math.isfinite(t_s)
+            and any(state in str(details) for state in SHUTDOWN_STATES)
+        ]
+
+    def _newest_s(self, otherwise_s: float) -> float:
+        """Return the newest time of simulation that an agent recorded, s; *otherwise_s* if none did."""
+        newest_s = 0.0
+        for table in self.tables.values():
+            if table.role == "agent" and table.has("t_s"):
+                for _, columns in table.each(("t_s",)):
+                    t_s = as_array(columns["t_s"])
+                    newest_s = max(newest_s, float(t_s[np.isfinite(t_s)].max(initial=0.0)))
+        return newest_s or otherwise_s
 
     def agent_summary(self, name: str) -> Mapping[str, Any]:
         """Return what the agent's half of the simulation summed up; empty for one that died."""

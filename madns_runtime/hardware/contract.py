@@ -186,6 +186,7 @@ class Device:
         """
         Return what it measures now, or None if there is nothing new.
 
+        A sample without a value says of a device of outputs alone that it is there; of others it is counted, and no news.
         Called at the device's rate; with a `fileno`, whenever that is readable, and as often as it gives samples.
         """
         return None

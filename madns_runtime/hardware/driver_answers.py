@@ -11,13 +11,13 @@ from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.plugin.context import clean_text, describe_exception
 
 
-def describe_fault(error: BaseException, where: str) -> str:
-    """Return in words what a driver's method raised, or that what it returned was refused; *where* names the method."""
+def describe_fault(error: BaseException, where: str, called: Any = None) -> str:
+    """Return in words what a driver's method *called* raised, or that its answer was refused; *where* names it."""
     if isinstance(error, MachineError):
         return clean_text(str(error))
     if isinstance(error, PluginError):
         return f"{where}: {clean_text(str(error))}"
-    return describe_exception(error, where)
+    return describe_exception(error, where, called)
 
 
 def identity_of(told: Any) -> str:

@@ -258,7 +258,7 @@ class InlineDevice:
         try:
             return call(*arguments)
         except (Exception, SystemExit) as error:
-            text = describe_exception(error, f"{type(self._device).__name__}.{method}")
+            text = describe_exception(error, f"{type(self._device).__name__}.{method}", call)
             raise BlamedError(f"device {self.name}: {text}") from error
 
     def _tried(self, method: str, call: Callable[[], object]) -> bool:

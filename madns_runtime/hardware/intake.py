@@ -99,6 +99,10 @@ class Intake:
         _check_times(sample, now_s + ahead_s, now_s)
         sample = self._checked(sample)
         self._page.header[page.ACTIVE_S] = now_s
+        if not sample.values and self._inputs:
+            # Nothing new, as None says it: only a device of outputs alone shows so that it is there.
+            self.count("empty_samples")
+            return
         if sample.device_s is not None:
             self.clock.add(sample.device_s, sample.taken_s)
         altered = self.faults.apply(sample)

@@ -122,7 +122,7 @@ class DeviceRunner:
         if isinstance(error, KeyboardInterrupt | GeneratorExit):
             raise error
         name = type(self._device).__name__ if self._device is not None else self._launch.kind
-        self.tell_error(self._blame(name, method, error))
+        self.tell_error(self._blame(name, method, error, self._device))
         self._failures += 1
         self._header[page.ERRORS] += 1
         self._close_device()
@@ -141,10 +141,11 @@ class DeviceRunner:
         if not self.gave_up and (leak := leak_of(self._first_bytes)):
             self._give_up(f"{type(self._device).__name__} {leak}, so it gets a process anew")
 
-    def _blame(self, driver: str, method: str, error: BaseException) -> str:
+    def _blame(self, driver: str, method: str, error: BaseException, device: Any) -> str:
         """Record what a driver's method raised, and return its words."""
         self._reactor.end_if_forked()  # by sys.exit, say: whoever forked it goes on
-        text = driver_answers.describe_fault(error, f"{driver}.{method}")
+        called = getattr(device, method, None)
+        text = driver_answers.describe_fault(error, f"{driver}.{method}", called)
         self._intake.event("error", monotonic(), why=text)
         return text
 
@@ -161,7 +162,7 @@ class DeviceRunner:
         try:
             device.close()
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
-            self._blame(type(device).__name__, "close", error)
+            self._blame(type(device).__name__, "close", error, device)
         self._header[page.STATE] = page.CLOSED
         self._records.event("closed", monotonic())
 
@@ -174,7 +175,7 @@ class DeviceRunner:
         try:
             device.make_safe()
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
-            self._blame(type(device).__name__, "make_safe", error)
+            self._blame(type(device).__name__, "make_safe", error, device)
             return False
         self._reactor.end_if_forked()
         self._header[page.MOVED] = 0.0

@@ -33,6 +33,8 @@ from madns_runtime.protocol.messages import Service
 from madns_runtime.timing.granted_clock import GrantedLimit
 
 LOOK_INTERVAL_S = 0.25
+REPEATS_UNTIMED = 10
+"""Calls of the timer behind the first at one simulated time that may each take as long as one alone; further ones share that time."""
 
 
 class LockstepHalf:
@@ -65,6 +67,7 @@ class LockstepHalf:
         self.close = self._jobs.close
         self._outstanding: deque[int] = deque()
         self._finished: dict[int, Future[Any]] = {}
+        self._standing = GrantedLimit(timeouts.tick_s)
         self._under_way: tuple[str, float] | None = None  # a call, and how long it may take, s
         threading.Thread(target=self._watch_calls, name="call-watch", daemon=True).start()
 
@@ -99,6 +102,13 @@ class LockstepHalf:
         """
         self._guard("timer", partial(self._half.call_timer, t_s))
         self._settle()
+        half, limit_s = self._half, self._timeouts.tick_s
+        if half.repeats == REPEATS_UNTIMED:
+            self._standing = GrantedLimit(limit_s)
+        elif half.repeats > REPEATS_UNTIMED and self._standing.is_over():
+            asked = f"{half.name}.timer asked {half.repeats} times in a row for t = {t_s:g} s"
+            why = f"for longer than {limit_s:g} s: simulated time stands (limit: timeouts.tick_s)"
+            self._meeting.fail(HOST, f"{asked}, {why}")
 
     def finish(self) -> Any:
         """

@@ -15,14 +15,17 @@ from typing import Any, Final, Protocol
 
 from madns_runtime.errors import MessageTooLarge, PluginError
 from madns_runtime.medium.outcomes import (
+    CHANNELS_MAX,
     DELIVERED,
     EVERYBODY,
     LOST,
+    OTHERS,
+    WORDS_MAX,
     LinkOutcome,
     Medium,
     MessageAccount,
 )
-from madns_runtime.plain_values import is_line, is_real, shown
+from madns_runtime.plain_values import LINE_CHARACTERS_MAX, is_line, is_real, shown
 from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Delivery, Transmission, TransmissionRefusal
 
@@ -32,6 +35,9 @@ LEAD_S: Final = 1.0
 
 _MAKE: Final[dict[str, Callable[[Any], Any]]] = {"arrives_s": float, "size_bytes": int}
 """Plain kinds of an outcome's values; others are texts."""
+_LINES: Final = ("outcome", "channel")
+"""Those of the texts that are counted by: what a receiver is called is told to its sender alone."""
+_LINE: Final = f"of at most {LINE_CHARACTERS_MAX} printable characters"
 
 
 class WayFaults(Protocol):
@@ -72,8 +78,11 @@ class Carrier:
         self._heap: list[tuple[float, str, int, int, str, Delivery, MessageAccount]] = []
 
     def account(self, channel: str = "") -> MessageAccount:
-        """Return what became of the messages of a channel."""
-        return self._accounts.setdefault(channel, MessageAccount())
+        """Return what became of the messages of a channel; beyond CHANNELS_MAX, of all further ones together."""
+        accounts = self._accounts
+        if channel not in accounts and len(accounts) >= CHANNELS_MAX:
+            channel = OTHERS
+        return accounts.setdefault(channel, MessageAccount())
 
     def enter(
         self,
@@ -131,6 +140,11 @@ class Carrier:
         if not outcomes:
             return {}
         delivered, lost = outcomes.pop(DELIVERED, 0), outcomes.pop(LOST, 0)
+        refused = outcomes.total()
+        del outcomes[OTHERS]
+        told = Counter(dict(outcomes.most_common(WORDS_MAX)))
+        if others := refused - told.total():  # of many channels, or of many words in one
+            told[OTHERS] = others
         total = {
             name: sum(getattr(account, name) for account in accounts)
             for name in ("transmissions", "sent", "in_flight", "undelivered", "heard_late")
@@ -140,8 +154,8 @@ class Carrier:
             "sent": total["sent"],
             "delivered": delivered - total["in_flight"] - total["undelivered"],
             "lost": lost,
-            "refused": sum(outcomes.values()),
-            "refused_because": dict(sorted(outcomes.items())),
+            "refused": refused,
+            "refused_because": dict(sorted(told.items())),
             "refusals_untold": self._untold,
             "in_flight": total["in_flight"],
             "undelivered": total["undelivered"],
@@ -208,6 +222,8 @@ def _is_plain(outcome: LinkOutcome) -> bool:
         type(outcome.to) is type(outcome.outcome) is type(outcome.channel) is str
         and outcome.outcome.isidentifier()
         and outcome.outcome.isascii()
+        and len(outcome.outcome) <= LINE_CHARACTERS_MAX
+        and is_line(outcome.channel)
         and (outcome.arrives_s is None or type(outcome.arrives_s) is float)
         and type(outcome.size_bytes) is int
         and outcome.size_bytes >= 0
@@ -224,16 +240,20 @@ def _plain(outcome: LinkOutcome) -> LinkOutcome:
     changed: dict[str, Any] = {}
     for name, wanted in (
         ("to", "a receiver's name"),
-        ("outcome", f"{DELIVERED!r}, {LOST!r}, or a word that says why not"),
+        ("outcome", f"{DELIVERED!r}, {LOST!r}, or a word that says why not, {_LINE}"),
         ("arrives_s", "a simulated time in seconds, or None"),
         ("size_bytes", "a number of bytes"),
-        ("channel", "a text"),
+        ("channel", f"a text {_LINE}"),
     ):
         value: Any = getattr(outcome, name)
         if name == "arrives_s" and value is None:
             continue
         is_fit = is_real(value) if name in _MAKE else isinstance(value, str)
-        if not is_fit or (name == "outcome" and (not is_line(value) or not value)):
+        if (
+            not is_fit
+            or (name in _LINES and not is_line(value))
+            or (name == "outcome" and not value)
+        ):
             raise PluginError(f"a LinkOutcome with {name} {shown(value)}: expected {wanted}")
         try:
             changed[name] = made = _MAKE.get(name, str)(value)

@@ -7,6 +7,7 @@ whose messages, the host knows of it.
 
 from __future__ import annotations
 
+import inspect
 import math
 import struct
 from collections import deque
@@ -32,6 +33,8 @@ UNKNOWN_RECEIVER: Final = "unknown_receiver"
 """Refused: there is nobody of that name, or it is the sender itself."""
 NOBODY_IN_REACH: Final = "nobody_in_reach"
 """Refused: a broadcast that nobody could receive."""
+WAY: Final = "a function of (sender, receiver, t_s)"
+"""Answer that depends on a message's way."""
 
 _KEY = struct.Struct("<3q")
 _CHANCES = float(2**64)
@@ -129,7 +132,7 @@ class LinkMedium:
         loss: float = 0.0,
         queue_max: int = 256,
     ) -> None:
-        _check_answers(delay_s, rate_byte_s, loss, queue_max)
+        _check_answers(delay_s, reach, rate_byte_s, loss, queue_max)
         self._agents = tuple(agents)
         self._index = {name: number for number, name in enumerate(agents)}
         self._chance = Chance(random)
@@ -184,7 +187,7 @@ class LinkMedium:
         return found or [outcome(to=to, outcome=NOBODY_IN_REACH)]
 
 
-def _check_answers(delay_s: Any, rate_byte_s: Any, loss: Any, queue_max: Any) -> None:
+def _check_answers(delay_s: Any, reach: Any, rate_byte_s: Any, loss: Any, queue_max: Any) -> None:
     """
     Refuse answers that no medium has.
 
@@ -196,9 +199,10 @@ def _check_answers(delay_s: Any, rate_byte_s: Any, loss: Any, queue_max: Any) ->
         (
             "delay_s",
             delay_s,
-            callable(delay_s) or _is_positive(delay_s),
-            "seconds, more than 0, or a function of (sender, receiver, t_s)",
+            _takes_way(delay_s) or _is_positive(delay_s),
+            f"seconds, more than 0, or {WAY}",
         ),
+        ("reach", reach, reach is None or _takes_way(reach), f"None or {WAY}"),
         (
             "rate_byte_s",
             rate_byte_s,
@@ -214,7 +218,24 @@ def _check_answers(delay_s: Any, rate_byte_s: Any, loss: Any, queue_max: Any) ->
         ),
     ):
         if not is_fit:
-            raise PluginError(f"LinkMedium: {name}: expected {wanted}, got {shown(value)}")
+            raise PluginError(f"LinkMedium: {name}: expected {wanted}, got {_shown_answer(value)}")
+
+
+def _takes_way(function: Any) -> bool:
+    """Tell whether a value can be called with a way, or does not say what it takes."""
+    try:
+        inspect.signature(function).bind("", "", 0.0)
+    except TypeError:
+        return False
+    except ValueError:  # of a built-in one
+        return callable(function)
+    return True
+
+
+def _shown_answer(value: Any) -> str:
+    """Return an answer for a message; of a function its name and what it takes."""
+    name = getattr(value, "__qualname__", None)
+    return f"{name}{inspect.signature(value)}" if name and callable(value) else shown(value)
 
 
 def _is_positive(value: Any) -> bool:

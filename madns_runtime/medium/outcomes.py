@@ -12,9 +12,11 @@ from madns_runtime.protocol.messages import Transmission
 DELIVERED: Final = "delivered"
 LOST: Final = "lost"
 OTHERS: Final = "others"
-"""Under this word those are counted for which WORDS_MAX others left no room."""
+"""Under this word those are counted for which WORDS_MAX others left no room, in this channel those for which CHANNELS_MAX did."""
 WORDS_MAX: Final = 256
 """Different outcomes of one channel: they are counted one by one, and told at the end."""
+CHANNELS_MAX: Final = 256
+"""Different channels of a run, each with an account of its own; further ones share that of OTHERS."""
 NO_MEDIUM: Final = "no_medium"
 """Refused: this run of the simulation has no medium."""
 EVERYBODY: Final = "*"

@@ -249,7 +249,7 @@ class HostSimulation(Protocol):
         """
         Do what is due at simulated time *t_s*, the time that was asked for, and return the next time wanted.
 
-        Called for the first time right after `start`. The next time must be later than *t_s*, or None;
+        Called for the first time right after `start`, for its time, which is before 0. The next time must be later than *t_s*, or None;
         how much later than asked for the call came says `HostContext.timer_lateness_s`.
         """
         return None

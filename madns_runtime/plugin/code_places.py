@@ -30,6 +30,15 @@ def place_of(thing: Any) -> str:
     return f"{file}:{line}"
 
 
+def line_of(thing: Any) -> str:
+    """Return NAME OF THE FILE:line where a function or class is written; empty if that is not known."""
+    try:
+        file, colon, line = place_of(thing).rpartition(":")
+    except Exception:  # noqa: BLE001 - a class of a plug-in's may raise anything when it is asked what it wraps
+        return ""
+    return f"{Path(file).name}:{line}" if colon and line.isdecimal() else ""
+
+
 def error_text(error: BaseException) -> str:
     """Return what an error says of itself; of one whose class cannot, that."""
     try:

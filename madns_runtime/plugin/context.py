@@ -24,7 +24,7 @@ from madns_runtime.medium.carrier import Carrier
 from madns_runtime.medium.mailbox import Mailbox
 from madns_runtime.medium.outcomes import LinkOutcome
 from madns_runtime.plain_values import is_real, shown
-from madns_runtime.plugin.code_places import error_text
+from madns_runtime.plugin.code_places import error_text, line_of
 from madns_runtime.plugin.device_view import DeviceView
 from madns_runtime.protocol.codec import pack, unpack
 from madns_runtime.protocol.messages import Service, Transmission
@@ -209,31 +209,37 @@ def check_sending(
         raise PluginError("deadline_s is simulated time, which has not begun")
 
 
-def describe_exception(error: BaseException, doing: str) -> str:
+def describe_exception(
+    error: BaseException, doing: str, called: Callable[..., Any] | None = None
+) -> str:
     """
     Return one line: which call of a plug-in raised what, and in which file and line.
 
-    The place is the innermost line of the plug-in's own folder, not that of a library which it called. Errors
-    that blame the user's file say all by themselves.
+    The place is the innermost line of the plug-in's own folder, not that of a library which it called; of what was
+    raised before its first line, as by arguments that it does not take, where it is written. Errors that blame the
+    user's file say all by themselves.
 
     Args:
         error: What was caught, one call above the plug-in.
         doing: The call, such as FleetHost.setup.
+        called: What was called, where it is known.
     """
     if isinstance(error, BlamedError | ConfigurationError | MissingExtraError):
         return clean_text(str(error))
     frames = traceback.extract_tb(error.__traceback__)
     place = ""
-    if frames:
+    if called is not None and not frames[1:]:
+        place = line_of(called)
+    elif frames:
         # A medium of the framework's calls the plug-in, too.
-        called = [frame for frame in frames[1:] if not _is_framework(Path(frame.filename))]
-        home = Path((called or frames[1:] or frames)[0].filename).parent
+        outside = [frame for frame in frames[1:] if not _is_framework(Path(frame.filename))]
+        home = Path((outside or frames[1:] or frames)[0].filename).parent
         own = [frame for frame in frames[1:] if _is_below(Path(frame.filename), home)]
         frame = own[-1] if own else frames[-1]
-        place = f" ({Path(frame.filename).name}:{frame.lineno})"
+        place = f"{Path(frame.filename).name}:{frame.lineno}"
     said = error_text(error)
     text = f": {clean_text(said)}" if said else ""
-    return f"{doing} raised {type(error).__name__}{text}{place}"
+    return f"{doing} raised {type(error).__name__}{text}{place and f' ({place})'}"
 
 
 def clean_text(text: str) -> str:

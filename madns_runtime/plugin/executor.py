@@ -121,7 +121,7 @@ def run_job(function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*arguments)
     except BaseException as error:  # a plug-in may raise anything
         name = getattr(function, "__qualname__", repr(function))
-        raise JobFailed(describe_exception(error, name)) from error
+        raise JobFailed(describe_exception(error, name, function)) from error
     finally:
         # One that it forked would answer, too, and take the next jobs.
         if os.getpid() != worker:

@@ -153,7 +153,7 @@ class Half:
             self.simulation = make()
         except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
             traceback.print_exception(error)  # to stderr.txt: nobody records yet
-            raise HalfFailed(describe_exception(error, f"{self.name}.__init__")) from error
+            raise HalfFailed(describe_exception(error, f"{self.name}.__init__", make)) from error
 
     def call(self, name: str, *arguments: Any) -> Any:
         """
@@ -177,7 +177,7 @@ class Half:
         except BaseException as error:
             if isinstance(error, ActionRefused) and name in ACTION_METHODS:
                 raise  # it says that it cannot, and the run goes on
-            raise self.failure(name, error) from error
+            raise self.failure(name, error, function) from error
         check = CHECKS.get(name)
         if check is None:
             return value
@@ -202,12 +202,13 @@ class Half:
         own: Callable[..., Any] | None = getattr(self.simulation, name, None)
         return own or partial(getattr(self.contract, name), self.simulation)
 
-    def failure(self, name: str, error: BaseException) -> HalfFailed:
-        """Return what to raise, or to tell, of an error that a method raised; its traceback is logged."""
+    def failure(self, name: str, error: BaseException, function: Any = None) -> HalfFailed:
+        """Return what to raise, or to tell, of an error that a method, or *function*, raised; its traceback is logged."""
         if isinstance(error, MachineError):  # a full disk: no fault of the plug-in's
             return HalfFailed(clean_text(str(error)))
         self._log("critical", "".join(traceback.format_exception(error)))
-        return HalfFailed(describe_exception(error, f"{self.name}.{name}"))
+        called = function or getattr(self.simulation, name, None)
+        return HalfFailed(describe_exception(error, f"{self.name}.{name}", called))
 
 
 class HostHalf(Half):
@@ -243,7 +244,7 @@ class HostHalf(Half):
         """Takes what agents sent while faults are in force, and hands it on to `take_now`."""
         self._calls = calls or HostCalls()
         self._timer_s = self._stand_s = -math.inf
-        self._repeats = 0
+        self.repeats = 0  # of the timer at one simulated time
         self._make_medium = program.medium
         self._calls.name = getattr(program.make, "__name__", "")
         began_s = self._calls.begin("__init__")
@@ -360,10 +361,10 @@ class HostHalf(Half):
         """
         t_s = max(now_s if self.next_s is None else self.next_s, self._timer_s)
         if t_s - self._stand_s > STAND_S:
-            self._stand_s, self._repeats = t_s, 0
+            self._stand_s, self.repeats = t_s, 0
         else:
-            self._repeats += 1
-        if self._repeats > REPEATS_MAX:
+            self.repeats += 1
+        if self.repeats > REPEATS_MAX:
             raise HalfFailed(
                 f"{self.name}.timer asked {REPEATS_MAX} times in a row for t = {t_s:g} s: simulated time stands"
             )

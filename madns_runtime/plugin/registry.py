@@ -363,13 +363,13 @@ def _contract_faults(half: Any, role: Role) -> list[str]:
     faults = [f"no method {name}()" for name in methods if not callable(getattr(half, name, None))]
     if faults:
         faults.append(f"subclass {contract.__name__} to inherit what is not needed")
-    for name in methods:
+    # Also those that a half may do without: a run would find out when it first calls them, which may be late.
+    for name in (each for each in vars(contract) if not each.startswith("_")):
         method, agreed = getattr(half, name, None), getattr(contract, name)
         wanted = tuple(inspect.signature(agreed).parameters)
         if callable(method) and not _takes(method, wanted):
             faults.append(f"{name}() must take ({', '.join(wanted)})")
-    for name in (each for each in vars(contract) if not each.startswith("_")):
-        if fault := deferral_fault(getattr(half, name, None)):
+        if fault := deferral_fault(method):
             faults.append(f"{name}() {fault}")
     if not _takes(half, ()):
         faults.append("it must be made without arguments; take what it needs in setup()")

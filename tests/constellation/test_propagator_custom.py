@@ -30,7 +30,7 @@ def folder(tmp_path):
         (
             "own.py:Demanding",
             PluginError,
-            r"^own.py:Demanding raised TypeError: .*orbit.* \(custom_propagator.py:\d+\)$",
+            r"^own.py:Demanding raised TypeError: .*orbit.* \(own.py:\d+\)$",
         ),
         ("own.py:Missing", PluginError, "Missing"),
         ("absent.py:Mine", PluginError, "no file .*absent.py"),

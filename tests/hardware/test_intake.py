@@ -92,6 +92,28 @@ def test_a_sample_that_holds_no_number_is_on_record_and_no_newest_sample():
     assert intake.summary()["field_not_finite"] == 1
 
 
+def test_samples_without_a_value_are_counted_and_keep_no_device_of_inputs_fresh():
+    intake, device_page, kept = make_intake()
+    intake.take(Sample(values={"level": 1.0}, taken_s=1.0), 1.0)
+    for second in (2.0, 3.0):
+        intake.take(Sample(values={}, taken_s=second), second)
+
+    header = device_page.header
+    assert (header[page.NEWEST_S], header[page.ARRIVED_S], header[page.SAMPLES]) == (1.0, 1.0, 1)
+    assert intake.summary()["empty_samples"] == 2
+    assert kept.samples == [("level", 1, (1.0,))]
+
+
+def test_a_device_of_outputs_alone_shows_by_a_sample_without_a_value_that_it_is_there():
+    valve = Channel(name="valve", direction="out")
+    device_page = DevicePage([valve])
+    intake = Intake((valve,), device_page, Kept(), seed=[1], frozen_s={}, pass_on=len)
+    intake.take(Sample(values={}, taken_s=2.0), 2.0)
+
+    assert (device_page.header[page.ARRIVED_S], device_page.header[page.SAMPLES]) == (2.0, 1)
+    assert "empty_samples" not in intake.summary()
+
+
 def test_an_input_that_is_no_number_keeps_no_other_from_being_told():
     intake, device_page, _ = make_intake()
     intake.take(Sample(values={"field": (NAN,) * 3, "level": 4.0}, taken_s=2.0), 2.0)

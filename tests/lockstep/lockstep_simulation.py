@@ -109,6 +109,10 @@ class Host(HostSimulation):
         if self.fault == "timer_stands":
             self.context.wake(t_s)
             return None
+        if self.fault == "timer_drags":
+            time.sleep(0.2)
+            self.context.wake(t_s)
+            return None
         if self.fault == "job_raise" and t_s >= 0.2:
             self.context.submit(square, -1)
         if self.fault == "job_kill" and t_s >= 0.2:

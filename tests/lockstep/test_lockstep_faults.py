@@ -1,6 +1,7 @@
 """What goes wrong in lockstep is named: who, in which call, why; and nothing of the run lives on."""
 
 import os
+import re
 import signal
 
 import pytest
@@ -68,6 +69,17 @@ def test_a_fault_of_a_plug_in_is_named(start_host, fault, who, expected):
     assert result["not_stopped"] == []
     ends = [path.read_text().splitlines()[-1] for path in run.folder.rglob("*.jsonl")]
     assert ends and all(end.startswith('{"end"') for end in ends)
+
+
+def test_a_slow_timer_that_lets_simulated_time_stand_is_ended_after_the_time_of_a_call(start_host):
+    run = start_host(fault="timer_drags", timeouts=IMPATIENT)
+    result = run.result()
+
+    assert (result["status"], run.process.returncode) == ("failed", 1)
+    assert result["who"] == "host"
+    told = r"Host.timer asked \d+ times in a row for t = -0.5 s, for longer than 1.5 s: simulated time stands"
+    assert re.match(told, result["reason"])
+    assert result["reason"].endswith(" (limit: timeouts.tick_s)")
 
 
 @pytest.mark.parametrize(("fault", "abandoned"), [("step_raise", 6), ("", 0)])

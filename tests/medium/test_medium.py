@@ -10,6 +10,7 @@ from madns_runtime.medium.carrier import LEAD_S, Carrier
 from madns_runtime.medium.links import LinkMedium
 from madns_runtime.medium.mailbox import HELD_MAX, NUMBERS_PER_LIFE, Mailbox
 from madns_runtime.medium.outcomes import (
+    CHANNELS_MAX,
     EVERYBODY,
     WORDS_MAX,
     LinkOutcome,
@@ -344,6 +345,12 @@ def test_losses_are_the_share_wanted_and_hang_on_the_seed_alone():
         ),
         (LinkOutcome(to="car-2", outcome=""), r"outcome '': expected"),
         (LinkOutcome(to="car-2", outcome=None), r"outcome None: expected"),
+        (LinkOutcome(to="car-2", outcome="a" * 201), r"outcome 'aaa+: expected .* at most 200"),
+        (
+            LinkOutcome(to="car-2", outcome="lost", channel="c" * 201),
+            r"channel 'ccc+: expected .* at most 200",
+        ),
+        (LinkOutcome(to="car-2", outcome="lost", channel="a\nb"), r"channel 'a\\nb': expected"),
         (LinkOutcome(to=["car-2"], outcome="lost"), r"to \['car-2'\]: expected a receiver's name"),
         (LinkOutcome(to=2, outcome="lost"), r"to 2: expected"),
         (LinkOutcome(to="car-2", outcome="lost", channel=[]), r"channel \[\]: expected a text"),
@@ -400,12 +407,29 @@ def test_numbers_and_texts_of_numpy_in_an_outcome_become_plain():
         ({"rate_byte_s": math.nan}, "rate_byte_s: expected"),
         ({"delay_s": 0.0}, "delay_s: expected seconds, more than 0, or a function"),
         ({"delay_s": "0.1"}, "delay_s: expected seconds"),
+        (
+            {"delay_s": lambda sender, receiver: 0.1},
+            r"delay_s: .* or a function of \(sender, receiver, t_s\), got .*<lambda>\(sender, receiver\)$",
+        ),
+        (
+            {"reach": lambda sender: None},
+            r"reach: expected None or a function of \(sender, receiver, t_s\), got .*<lambda>\(sender\)$",
+        ),
+        ({"reach": 1}, "reach: expected None or a function of .*, got 1$"),
         ({"queue_max": -1}, "queue_max: expected a whole number, 0 or more, got -1"),
     ],
 )
 def test_a_medium_that_cannot_be_is_refused_when_it_is_made(answers, told):
     with pytest.raises(PluginError, match=f"LinkMedium: {told}"):
         LinkMedium(NAMES, np.random.default_rng(1), **{"delay_s": 0.1, **answers})
+
+
+def test_functions_of_which_no_arguments_are_known_are_taken_as_they_are():
+    def near(*who, **rest):
+        return None
+
+    for reach in (near, dict, None):
+        medium(reach=reach)
 
 
 @pytest.mark.parametrize("answer", [True, False, 3, ""])
@@ -442,3 +466,17 @@ def test_reasons_beyond_a_number_are_counted_together_and_what_arrives_by_itself
     assert account.outcomes["others"] == 10
     assert account.outcomes[words[0]] == 2
     assert account.outcomes["delivered"] == account.outcomes["lost"] == 1
+
+
+def test_channels_beyond_a_number_share_an_account_and_a_run_tells_no_more_words_than_one_of_them():
+    desk = Desk()
+    for number in range(CHANNELS_MAX + 10):
+        for word in (f"jammed_{number}", f"shadowed_{number}"):
+            desk.enter(LinkOutcome(to="car-2", outcome=word, channel=f"channel {number}"))
+
+    account = desk.carrier.to_mapping()
+    assert account["sent"] == account["refused"] == 2 * (CHANNELS_MAX + 10)
+    assert desk.carrier.account("others").transmissions == 20
+    assert desk.carrier.account("never heard of") is desk.carrier.account("others")
+    assert len(account["refused_because"]) == WORDS_MAX + 1
+    assert sum(account["refused_because"].values()) == account["refused"]

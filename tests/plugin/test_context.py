@@ -65,6 +65,39 @@ def test_place_is_the_plugins_own_line_not_the_librarys(plugin):
     assert told(plugin["step"], "{") == expected
 
 
+def test_call_that_does_not_fit_is_told_where_the_function_is_written_not_where_it_was_called():
+    def step() -> None:
+        """Takes no tick."""
+
+    line = step.__code__.co_firstlineno
+    try:
+        step(1)
+    except TypeError as error:
+        text = describe_exception(error, "Rover.step", step)
+
+    assert text.endswith(f"takes 0 positional arguments but 1 was given (test_context.py:{line})")
+
+
+def test_call_that_does_not_fit_what_has_no_file_is_told_without_a_place():
+    try:
+        len(1, 2)
+    except TypeError as error:
+        text = describe_exception(error, "Rover.step", len)
+
+    assert text == "Rover.step raised TypeError: len() takes exactly one argument (2 given)"
+
+
+def test_job_that_takes_other_arguments_is_told_where_it_is_written():
+    line = run_nothing.__code__.co_firstlineno
+
+    with pytest.raises(JobFailed, match=rf"\(test_context\.py:{line}\)$"):
+        run_job(run_nothing, 3)
+
+
+def run_nothing() -> None:
+    """Do nothing, with nothing."""
+
+
 def test_exception_without_a_text_is_told_by_its_kind(plugin):
     assert told(plugin["check"], -1) == "Rover.step raised ValueError (rover.py:14)"
 

@@ -96,6 +96,32 @@ def test_whatever_a_call_raises_is_told_with_its_line_and_logged(logged, error, 
     assert logged[0].startswith("Traceback")
 
 
+def test_a_method_or_medium_that_takes_other_arguments_is_told_where_it_is_written(logged):
+    class Mute:
+        def carry(self, transmission):
+            raise AssertionError
+
+    class Strange(HostSimulation):
+        def __init__(self, speed):
+            raise AssertionError
+
+    half = made(Base, logged, HostHalf)
+    half.carrier.medium = Mute()
+    lines = [each.__code__.co_firstlineno for each in (Base.timer, Mute.carry)]
+    for line, call in zip(
+        lines,
+        (
+            lambda: half.call("timer", 0.0, "more"),
+            lambda: half.take("car-1", Transmission("car-2", 0, 0.0, None)),
+        ),
+        strict=True,
+    ):
+        with pytest.raises(HalfFailed, match=rf"TypeError: .*\(test_half\.py:{line}\)$"):
+            call()
+    with pytest.raises(HalfFailed, match=r"__init__ raised TypeError: .*\(test_half\.py:\d+\)$"):
+        made(Strange, logged)
+
+
 def test_a_full_disk_is_no_fault_of_the_plug_in(logged):
     with pytest.raises(HalfFailed, match=r"^/x: No space left on device$"):
         made(Rover, logged).call("setup", MachineError("/x: No space left on device"), {})

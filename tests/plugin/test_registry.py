@@ -305,6 +305,31 @@ def test_agent_without_the_methods_of_the_contract_is_refused(write, tmp_path):
     assert "subclass AgentSimulation to inherit what is not needed" in message
 
 
+def test_method_that_a_run_may_call_late_or_never_is_looked_at_like_any_other(write, tmp_path):
+    message = half_refusal(
+        write,
+        tmp_path,
+        """
+        class Agent(AgentSimulation):
+            def step(self, tick): pass
+            def hear(self): pass
+            def refused(self, refusal, why): pass
+            def device_changed(self, device): pass
+            def begin_action(self): pass
+            def abandon(self, reason): pass
+        """,
+    )
+
+    for wanted in (
+        "hear() must take (self, delivery)",
+        "refused() must take (self, refusal)",
+        "device_changed() must take (self, device, status)",
+        "begin_action() must take (self, action)",
+        "abandon() must take (self)",
+    ):
+        assert wanted in message
+
+
 def test_method_with_other_parameters_is_refused(write, tmp_path):
     message = half_refusal(
         write,

@@ -181,7 +181,7 @@ FAULTS = [
     ),
     (
         ("host.py", "reach=road.reach", "reach=1"),
-        "host: RingRoad.medium.carry raised TypeError",
+        "host: RingRoad.medium raised PluginError: LinkMedium: reach: expected None or a function",
     ),
 ]
 IDS = ("no medium", "no such agent", "no hear", "no such medium", "no medium made", "broken medium")

@@ -46,7 +46,11 @@ SECRET_REFUSED = (
 )
 SECRET_HIDDEN = "not understood, and not shown here: its name says that it is a secret"
 
-Address = Annotated[str, like(r"[^\s/@\[\],]+", "a host name or an address, and nothing more")]
+_ADDRESS = r"(?![^:]*:\d+$)[^\s/@\[\],]+"
+"""Of one colon with digits behind it, those are a port; an address of IPv6 has more colons."""
+_ADDRESS_WORDS = "a host name or an address, and nothing more"
+Address = Annotated[str, like(_ADDRESS, _ADDRESS_WORDS)]
+SshAddress = Annotated[str, like(_ADDRESS, f"{_ADDRESS_WORDS}; a port belongs in ansible_port")]
 RootFolder = Annotated[
     str,
     like(
@@ -60,9 +64,9 @@ RootFolder = Annotated[
 class Variables(SettingVariables):
     """The variables that COSMoS knows, settings first, with what follows of several; others are none of its business."""
 
-    ansible_host: Address | None = None
+    ansible_host: SshAddress | None = None
     """Address of the machine; its name if not given."""
-    ansible_ssh_host: Address | None = None
+    ansible_ssh_host: SshAddress | None = None
     """Old name of ansible_host, which it overrides, as in Ansible."""
     ansible_user: Annotated[str, like(r"[^\s:/-][^\s:/]*", "the name of a user")] | None = None
     """User to log in as."""

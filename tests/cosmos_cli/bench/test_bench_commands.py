@@ -181,6 +181,13 @@ def test_folder_without_a_suite_and_a_faulty_file_are_bad_input(tmp_path, capsys
     assert cosmos(["bench", "capacity", "--first", "9", "--largest", "8"]) == 2
     assert "--first 9 is more than --largest 8" in capsys.readouterr().err
 
+
+def test_trials_shorter_than_a_tick_are_told_by_the_commands_own_options(capsys):
+    assert cosmos(["bench", "capacity", "--hz", "0.1", "--seconds", "1"]) == 2
+
+    told = "error: --seconds 1 is less than one tick at --hz 0.1: give at least --seconds 10"
+    assert capsys.readouterr().err.strip() == told
+
     assert cosmos(["bench", "capacity", "--set", "agents.count=3"]) == 2
     assert "trials set that themselves" in capsys.readouterr().err
 

@@ -188,10 +188,29 @@ def test_operator_that_was_stopped_says_so_and_what_it_costs(launched: Launched)
     launched.signal(signal.SIGSTOP)
     time.sleep(1.6)  # for longer than STALL_S
     launched.signal(signal.SIGCONT)
-    launched.outcome()
+    outcome = launched.outcome()
 
+    assert texts(outcome) == []  # it came to its end all the same
     assert "this computer slept, or this command was stopped, for " in launched.talk
     assert "keep it awake" in launched.talk
+
+
+def test_verdict_of_a_failed_run_hears_that_its_operator_was_stopped(launched: Launched) -> None:
+    launched.start(
+        host={"runs_s": 60},
+        agents={"agent_killed_after_s": 5},
+        constants={"operator.STALL_S": 1.5},
+    )
+    launched.wait_for_note("launched [")
+
+    launched.signal(signal.SIGSTOP)
+    time.sleep(1.6)  # for longer than STALL_S
+    launched.signal(signal.SIGCONT)
+    outcome = launched.outcome()
+
+    assert outcome["host_result"]["status"] == "failed"
+    told = [text for text in texts(outcome) if text.startswith("this computer slept, or this ")]
+    assert len(told) == 1
 
 
 def test_workers_that_a_killed_host_leaves_in_its_group_are_killed(launched: Launched) -> None:

@@ -309,6 +309,13 @@ def test_secret_is_not_shown_by_a_fault_of_syntax_either(read):
     assert "swordfish" not in str(caught.value)
 
 
+@pytest.mark.parametrize("address", ["fe80::1%eth0", "::1", "2001:db8::17:22", "pi01.local"])
+def test_address_with_colons_of_its_own_has_no_port(read, address):
+    (machine,) = read(f"all: {{hosts: {{m: {{ansible_host: '{address}'}}}}}}\n")
+
+    assert machine.variables.address == address
+
+
 @pytest.mark.parametrize(
     ("variable", "told"),
     [
@@ -320,6 +327,9 @@ def test_secret_is_not_shown_by_a_fault_of_syntax_either(read):
         ("ansible_shell_type: fish", "expected sh"),
         ("ansible_become: yes please", "expected true or false, got 'yes please'"),
         ("ansible_host: pi@10.0.0.1", "expected a host name or an address, and nothing more"),
+        ("ansible_host: 10.0.0.1:2222", "and nothing more; a port belongs in ansible_port"),
+        ("ansible_ssh_host: pi01.local:22", "and nothing more; a port belongs in ansible_port"),
+        ("cosmos_host_address: 10.0.0.1:4", "expected a host name or an address, and nothing more"),
         ("inventory_hostname: x", "Ansible sets this variable itself"),
         ("cosmos-devices: [x]", "in a variable's name, did you mean cosmos_devices?"),
         ("cosmos_root: /", "expected a folder of COSMoS's own"),

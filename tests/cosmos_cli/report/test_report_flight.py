@@ -159,6 +159,22 @@ def test_delta_v_that_a_failure_came_before_was_not_given(tmp_path):
     assert [(one["commanded"], one["given, m/s"]) for one in rows] == [(3, 0.49)] * 2
 
 
+def test_delta_v_that_the_end_of_a_killed_host_came_before_was_not_given(tmp_path, monkeypatch):
+    made = SyntheticRun(tmp_path / "runs", make_config(2, ticks=TICKS, tick_hz=TICK_HZ))
+    made.ticks = TICKS // 2  # nobody told a shutdown: the records of its agents end with the host
+    monkeypatch.setitem(record.__globals__, "TICKS", made.ticks)
+    made.write(with_states=True)
+    record(made)
+    finish_run(made.run, None, made.expected, has_report=False)
+
+    control = blocks_of(made)["Control"]
+
+    rows = cells(control["Maneuvers by agent"])
+    trace = control["Delta-v spent"].choices[0].marks[0]
+    assert (trace.x.tolist(), trace.y.tolist()) == ([0.0, 4.0, 4.9], [0.0, 0.49, 0.49])
+    assert [(one["commanded"], one["given, m/s"]) for one in rows] == [(3, 0.49)] * 2
+
+
 def test_a_broken_inequality_is_drawn_apart_and_counted(blocks):
     figure = blocks["Control"]["Slack of the synchronous inequality"]
     trace, drawn = figure.choices[0].marks[0], to_plotly(figure).choices[0][1][0]

@@ -249,7 +249,7 @@ class Cockpit:
         except BaseException as error:  # it may raise anything
             if is_from_outside(error):
                 raise
-            raise BlamedError(describe_exception(error, f"{self._name}.{name}")) from error
+            raise BlamedError(describe_exception(error, f"{self._name}.{name}", method)) from error
 
 
 def _do_nothing(*_arguments: object) -> None:

@@ -107,7 +107,7 @@ class OwnProtocol:
         except BaseException as error:  # of a user's class: told by its name
             if is_from_outside(error):
                 raise
-            raise BlamedError(describe_exception(error, f"{self._name}.{method}")) from error
+            raise BlamedError(describe_exception(error, f"{self._name}.{method}", call)) from error
 
     def _wrong(self, method: str, expected: str, told: Any) -> BlamedError:
         return BlamedError(f"{self._name}.{method}: expected {expected}, got {told!r:.80}")

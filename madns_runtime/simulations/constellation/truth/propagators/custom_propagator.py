@@ -98,7 +98,7 @@ def _call(
         if is_from_outside(error):
             raise
         doing = f"{implementation}.propagate at {t0_s:g} s"
-        raise BlamedError(describe_exception(error, doing)) from error
+        raise BlamedError(describe_exception(error, doing, propagator.propagate)) from error
 
 
 @lru_cache(maxsize=4)
@@ -119,7 +119,7 @@ def load_custom(implementation: str, base_directory: str) -> Propagator:
     except BaseException as error:  # a class of one's own may raise anything
         if is_from_outside(error):
             raise
-        raise BlamedError(describe_exception(error, implementation)) from error
+        raise BlamedError(describe_exception(error, implementation, made)) from error
     if not callable(getattr(propagator, "propagate", None)):
         raise BlamedError(
             f"{implementation}: expected a class with the method "
