@@ -537,7 +537,11 @@ class Wrong(Own):
     def METHOD(self, given):
         BODY
 """
-TALK = [sys.executable, "-c", "import sys\nfor line in sys.stdin: print('A', flush=True)"]
+TALK = [
+    sys.executable,
+    "-c",
+    "import sys\nsys.stdin.readline()  # the setup\nfor line in sys.stdin: print('A', flush=True)",
+]
 
 
 @pytest.mark.parametrize(
@@ -602,10 +606,6 @@ def test_faults_of_a_protocol_of_ones_own_that_are_no_counts_are_left_out(tmp_pa
     text = OWN.partition("class Wrong")[0].replace("faults = 3", faults)
     (tmp_path / "own.py").write_text(text)
     flight = attached({"kind": "stdio"}, "own.py:Own") | {"command": TALK}
-    flight["command"] = [
-        *TALK[:2],
-        "import sys\nsys.stdin.readline()\n" + TALK[2].partition("\n")[2],
-    ]
     with Ship(tmp_path, None, flight=flight) as ship:
         ship.run(2)
 

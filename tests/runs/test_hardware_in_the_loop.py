@@ -136,7 +136,8 @@ def test_sensor_of_a_computer_that_is_read_beside_it_is_scored_against_its_model
     for part in loop_latency.PARTS:
         assert f"\n{part} " in told
     scores = told.partition("magnetometer, field: prediction against measurement, T")[2]
-    rows = [line.split() for line in scores.splitlines()[2:5]]
+    table = scores.partition("\nagent ")[2].partition("\n\n")[0]
+    rows = [line.split() for line in table.splitlines()[1:]]
     assert [row[0] for row in rows] == list(COMPUTERS)
     for _, count, predicted, measured, score, _ in rows:
         assert int(count) > 50

@@ -114,7 +114,7 @@ def test_a_killed_agent_takes_nothing_of_its_satellites_truth_with_it(tmp_path):
     lost = states(found, "agent-02")[1]
     recorded = rows(place.directory(control) / "agents/agent-02/state.jsonl")
     own = np.array([lost[row[0]] - row[1:] for row in recorded])
-    assert np.abs(own).max() < 2e-6
+    assert np.abs(own).max() < 6e-6  # recorded to 10 um
 
 
 @pytest.mark.timeout(300)
