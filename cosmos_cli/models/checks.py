@@ -96,6 +96,16 @@ def scenario_checks(
     return resolve_checks(scenario.checks, around)
 
 
+def unjudged_remark(expectations: Sequence[Expectation], *, is_lockstep: bool) -> str:
+    """Return in words that runs of a time mode can judge none of these, and end without a result; empty where some are."""
+    if not expectations or any(e.is_judged_in(is_lockstep=is_lockstep) for e in expectations):
+        return ""
+    return (
+        f"none can be judged, such as {expectations[0].name}: runs in lockstep do not record its stream, and this one"
+        " would end as DATA INCOMPLETE; add a check of another stream, or fly in real time"
+    )
+
+
 def _faults_among(rule: CheckRule, earlier: dict[str, CheckRule]) -> Iterator[RuleFault]:
     if rule.name in earlier:
         yield ("name",), f"expected unique names, got {rule.name!r} again"

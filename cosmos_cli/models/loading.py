@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
-from cosmos_cli.models.checks import scenario_checks
+from cosmos_cli.models.checks import scenario_checks, unjudged_remark
 from cosmos_cli.models.document import Document, read_document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.executor_answer import EXECUTOR_KIND, ask_executor
@@ -243,6 +243,9 @@ def _check(
     faults += timeline.faults
     checks = scenario_checks(scenario, answers, streams, broken)
     faults += [document.fault(("checks", *where), text) for where, text in checks.faults]
+    lockstep = not broken and scenario.time.is_lockstep
+    if text := unjudged_remark(checks.expectations, is_lockstep=lockstep):
+        remarks = (*remarks, document.fault(("checks",), text, at_key=True))
     if broken or answers.parameters is None or faults:
         told = _told_once(faults, document)
         raise InputError(faults=told, omitted=answers.omitted)

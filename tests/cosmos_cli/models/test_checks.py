@@ -227,6 +227,27 @@ def test_all_faults_are_told_at_once(tmp_path):
     ]
 
 
+@pytest.mark.parametrize(
+    ("mode", "checks", "told"),
+    [
+        ("lockstep", [f"{TICKS}, below: 3"], ["none can be judged, such as a: runs in lockstep"]),
+        ("lockstep", [f"{TICKS}, below: 3", "name: b, event: start"], []),
+        ("realtime", [f"{TICKS}, below: 3"], []),
+        ("lockstep", [], []),
+    ],
+)
+def test_checks_none_of_which_can_be_judged_are_told_before_the_run(tmp_path, mode, checks, told):
+    text = "".join(f"  - {{{check}}}\n" for check in checks)
+    found = check_scenario(
+        f"name: a\nsimulation: counter\nagents: {{count: 1}}\ntime: {{mode: {mode}, duration_s: 1}}\n"
+        + (f"checks:\n{text}" if text else ""),
+        tmp_path / "scenario.yaml",
+    )
+
+    assert len(found.remarks) == len(told)
+    assert all(words in remark.text for words, remark in zip(told, found.remarks, strict=True))
+
+
 def test_more_checks_than_are_followed_are_refused(tmp_path):
     many = [f"name: c{number}, event: start" for number in range(1001)]
 
