@@ -8,6 +8,7 @@ from cosmos_cli.diff.compare import Comparison, KeyDifference, Timed
 from cosmos_cli.diff.fields import RecordPlace
 from cosmos_cli.diff.stream import Alone, By, StreamDifference
 from cosmos_cli.report.cells import format_cell
+from cosmos_cli.report.terminal import verdict_line
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.name_ranges import names_by
 from cosmos_cli.ui.plural import counted
@@ -36,8 +37,8 @@ KEY_WORDS: Mapping[By, str] = {"tick": "tick ", "time": "t = ", "order": "record
 def print_comparison(console: Console, found: Comparison) -> None:
     """Print a comparison on stdout; its last line says whether the runs are the same."""
     names = (found.a.run.name, found.b.run.name)
-    console.data(f"A  {names[0]}: {found.a.document.get('verdict') or 'no verdict'}")
-    console.data(f"B  {names[1]}: {found.b.document.get('verdict') or 'no verdict'}")
+    console.data(verdict_line(f"A  {names[0]}", found.a.document))
+    console.data(verdict_line(f"B  {names[1]}", found.b.document))
     for line in found.missing:
         console.data(f"missing: {line}")
     for line in found.remarks:

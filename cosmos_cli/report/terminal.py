@@ -9,6 +9,7 @@ from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.report.build import figures_of
 from cosmos_cli.report.cells import format_cell, format_measured
 from cosmos_cli.ui.console import Column, Console
+from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.analysis.values import ReportRemark, Section, TableBlock
 
 CHECK_COLUMNS = (
@@ -24,7 +25,7 @@ def print_report(
     console: Console, document: Mapping[str, Any], sections: Sequence[Section]
 ) -> None:
     """Print a run's report on stdout."""
-    console.data(f"{document.get('run')}: {document.get('verdict') or 'no verdict'}")
+    console.data(verdict_line(str(document.get("run")), document))
     console.data("")
     for name, value, remark in figures_of(document):
         console.data(f"  {name:<18}{value:>14}   {remark}")
@@ -38,6 +39,11 @@ def print_report(
         console.data(f"problem: {problem.get('text')}")
     for section in sections:
         _print_section(console, section)
+
+
+def verdict_line(name: str, document: Mapping[str, Any]) -> str:
+    """Return the line of a run's verdict, as its document has it: somebody may have put more than a line there."""
+    return clean_line(f"{name}: {document.get('verdict') or 'no verdict'}", length_max=None)
 
 
 def _print_section(console: Console, section: Section) -> None:

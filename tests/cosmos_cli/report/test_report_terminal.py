@@ -27,3 +27,9 @@ def test_what_a_chapter_says_before_its_tables_is_told(capsys):
 
     lines = capsys.readouterr().out.splitlines()
     assert lines[lines.index("Control") + 1] == "Slots by truth."
+
+
+def test_a_verdict_that_somebody_wrote_several_lines_into_is_one_line(capsys):
+    print_report(Console(), {"run": "0001-a", "verdict": "FAILED\nPASSED\r\x1b[2J"}, [])
+
+    assert capsys.readouterr().out.splitlines()[0] == r"0001-a: FAILED\nPASSED\r\x1b[2J"
