@@ -56,7 +56,7 @@ def test_several_records_of_one_tick_are_paired_in_their_order():
     assert [i.tolist() for i in pair_up(rows([7, 7, 7]), rows([7, 7]), 0.25)] == [[0, 1], [0, 1]]
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("far", [1e18, 1e300, 1.7e308, -1.7e308])
 @pytest.mark.parametrize("count", [1, 4])
 def test_one_key_that_is_far_away_costs_no_other_its_partner(far, count):
@@ -167,7 +167,7 @@ def test_whole_numbers_that_no_float_can_hold_differ_by_their_last_digit(kind):
     assert found.values == (1_764_000_000_000_000_001, 1_764_000_000_000_000_002)
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_run_that_diverged_differs_without_a_root_mean_square():
     found = FieldDifference(Field("x_m", "m"))
 
@@ -176,7 +176,7 @@ def test_a_run_that_diverged_differs_without_a_root_mean_square():
     assert (found.different, found.max) == (1, 1e300)
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_runs_that_diverged_to_either_side_cost_no_warning_of_our_source():
     found = FieldDifference(Field("x_m", "m"))
 

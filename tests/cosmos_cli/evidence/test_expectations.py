@@ -130,7 +130,7 @@ def test_a_statistic_is_that_of_all_records_in_its_time_however_they_are_read(
     assert result.passed
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("statistic", ["mean", "rms", "sd"])
 def test_a_statistic_of_values_that_diverged_is_not_finite_and_breaks_its_check(
     statistic, monkeypatch

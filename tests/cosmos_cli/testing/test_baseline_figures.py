@@ -123,7 +123,7 @@ def test_no_record_of_an_agent_that_there_is_counts_as_0_and_has_no_other_figure
     assert compared["mean"].reason() == "mean: nobody of * recorded x"
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("statistic", ["mean", "rms", "sd"])
 def test_a_statistic_of_values_that_diverged_never_passes_and_is_no_number(
     baseline, tmp_path, statistic
