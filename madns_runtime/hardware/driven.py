@@ -75,6 +75,11 @@ class DrivenDevice:
         """Full name of the device, such as pi22/imu."""
         return self.seat.launch.full_name
 
+    def hang_up(self) -> None:
+        """Close both ends of every pair: nobody uses the device any longer."""
+        for end in (*self.ends.values(), *self.seat.users.values()):
+            end.close()
+
     def refusal_of(self, action: str) -> str:
         """Return why a fault cannot be inserted around it; empty if it can."""
         try:

@@ -227,6 +227,7 @@ class InlineDevice:
         self._make_safe(self._now_s())
         self._tried("close", self._device.close)
         self._intake.close()
+        self._own_end.close()
         account = self._account
         return {
             "status": account.status,

@@ -383,6 +383,8 @@ class DeviceManager:
             wait_for(self._guardian_pid, deadline_s + KILL_WAIT_S)
             self._hear_guardian()
             self._guardian.close()
+        for driven in self._devices.values():
+            driven.hang_up()
         self._claims.release()
         return {name: driven.summary() for name, driven in self._devices.items()}
 

@@ -192,11 +192,13 @@ def test_a_car_that_the_timeline_has_brake_stands_and_those_behind_it_stop_too(c
     run = cosmos.folder / "runs" / result["run"] / "host"
     (braking,) = {
         json.loads(line)["agents"][0]
-        for line in (run / "events.jsonl").open()
+        for line in (run / "events.jsonl").read_text().splitlines()
         if "action_began" in line
     }
     rows = [
-        row for line in (run / "road.jsonl").open() if isinstance(row := json.loads(line), list)
+        row
+        for line in (run / "road.jsonl").read_text().splitlines()
+        if isinstance(row := json.loads(line), list)
     ]
     speeds = {t_s: speed for t_s, agent, _, speed, _ in rows if agent == braking}
     assert max(speed for t_s, speed in speeds.items() if t_s < 20) > 1

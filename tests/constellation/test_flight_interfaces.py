@@ -621,6 +621,7 @@ def test_a_socket_that_somebody_listens_at_is_left_to_him_and_one_left_behind_gi
 
     with pytest.raises(BlamedError, match="cannot be listened at: another program listens there"):
         Attached(tmp_path, None, flight=attached(transport))
+    assert (tmp_path / "a.sock").is_socket()
     first.close()
     with Attached(tmp_path, None, flight=attached(transport)):
         assert (tmp_path / "a.sock").is_socket()

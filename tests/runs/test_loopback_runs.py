@@ -117,7 +117,7 @@ def test_stress_and_health_run_beside_the_agents(tmp_path):
 
     health = records(next(evidence.glob("machines/*/health.jsonl")))
     assert len(health) >= 3
-    schema = json.loads(next(evidence.glob("machines/*/health.jsonl")).open().readline())
+    schema = json.loads(next(evidence.glob("machines/*/health.jsonl")).read_text().splitlines()[0])
     names = [field["name"] for field in schema["fields"]]
     assert {"cpu_percent", "temperature_c", "throttled"} & set(names)
 

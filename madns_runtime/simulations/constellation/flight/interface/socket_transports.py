@@ -69,17 +69,22 @@ class SocketLink(StreamTransport):
             )
         if not self._listens:
             return
-        try:
-            self._listener = listener = socket.socket(self._family, socket.SOCK_STREAM)
-            listener.setblocking(False)
-            if self._family == socket.AF_UNIX:
-                _remove_socket(self._place, self.name)
-            else:
-                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(self._place)
-            listener.listen(1)
-        except OSError as error:
-            raise BlamedError(f"{self.name}: cannot be listened at: {error}") from error
+        with contextlib.ExitStack() as unless_listening:
+            try:
+                listener = unless_listening.enter_context(
+                    socket.socket(self._family, socket.SOCK_STREAM)
+                )
+                listener.setblocking(False)
+                if self._family == socket.AF_UNIX:
+                    _remove_socket(self._place, self.name)
+                else:
+                    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                listener.bind(self._place)
+                listener.listen(1)
+            except OSError as error:
+                raise BlamedError(f"{self.name}: cannot be listened at: {error}") from error
+            unless_listening.pop_all()
+        self._listener = listener
         self.address = _shown(listener.getsockname())
 
     def push(self) -> None:
@@ -184,12 +189,15 @@ class UdpLink(Transport):
         Raises:
             BlamedError: It cannot be had.
         """
-        try:
-            self._socket = one = socket.socket(self._family, socket.SOCK_DGRAM)
-            one.setblocking(False)
-            one.bind(self._local)
-        except OSError as error:
-            raise BlamedError(f"{self.name}: cannot be received at: {error}") from error
+        with contextlib.ExitStack() as unless_bound:
+            try:
+                one = unless_bound.enter_context(socket.socket(self._family, socket.SOCK_DGRAM))
+                one.setblocking(False)
+                one.bind(self._local)
+            except OSError as error:
+                raise BlamedError(f"{self.name}: cannot be received at: {error}") from error
+            unless_bound.pop_all()
+        self._socket = one
         self.address = _shown(one.getsockname())
 
     def fds(self) -> tuple[int, ...]:
