@@ -75,11 +75,6 @@ class DrivenDevice:
         """Full name of the device, such as pi22/imu."""
         return self.seat.launch.full_name
 
-    def hang_up(self) -> None:
-        """Close both ends of every pair: nobody uses the device any longer."""
-        for end in (*self.ends.values(), *self.seat.users.values()):
-            end.close()
-
     def refusal_of(self, action: str) -> str:
         """Return why a fault cannot be inserted around it; empty if it can."""
         try:
@@ -121,6 +116,12 @@ class DrivenDevice:
     def _counts(self) -> dict[str, Any]:
         """Return what its processes counted, where the last one ended without its report."""
         return {**counts_of(self.seat.page), "unreported": 1}
+
+    def close(self) -> dict[str, Any]:
+        """Close both ends of every pair, which nobody uses any longer, and return what the run came to."""
+        for end in (*self.ends.values(), *self.seat.users.values()):
+            end.close()
+        return self.summary()
 
     def summary(self) -> dict[str, Any]:
         """Return what the run came to."""

@@ -383,10 +383,8 @@ class DeviceManager:
             wait_for(self._guardian_pid, deadline_s + KILL_WAIT_S)
             self._hear_guardian()
             self._guardian.close()
-        for driven in self._devices.values():
-            driven.hang_up()
         self._claims.release()
-        return {name: driven.summary() for name, driven in self._devices.items()}
+        return {name: driven.close() for name, driven in self._devices.items()}
 
     def _wait(self, process: DeviceProcess, deadline_s: float) -> None:
         if process.pid and not wait_for(process.pid, deadline_s):
