@@ -278,6 +278,7 @@ def test_estimates_that_diverged_cost_no_warning_of_our_source(fly):
     assert "compared nothing itself" not in done.stdout
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_estimates_and_commands_that_diverged_are_told_as_json(fly, capsys):
     fly(), fly(slot_error_deg=1e200, delta_v_m_s=1.7e308)
 

@@ -121,6 +121,7 @@ class ConstellationDifference:
         return total
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of runs of which one diverged
 def compare_runs(a: ComparedRun, b: ComparedRun) -> ConstellationDifference:
     """
     Return what differs between two runs.
