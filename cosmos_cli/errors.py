@@ -91,9 +91,8 @@ class Fault:
     def _where(self) -> str:
         if self.override:
             return f"--set {self.override}"
-        if self.line is None:
-            return self.file
-        return f"{self.file}:{self.line}:{self.column}"
+        file = self.file.replace("\n", "\\n").replace("\r", "\\r")  # a name's end is no line's
+        return file if self.line is None else f"{file}:{self.line}:{self.column}"
 
 
 def _cut(text: str) -> str:

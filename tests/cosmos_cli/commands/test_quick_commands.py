@@ -60,6 +60,16 @@ def test_validate_keeps_a_file_with_a_line_end_in_its_name_on_one_line(cosmos, w
     assert "a\\nb.yaml: ok.yaml: ok: a, 3 agents" in out.splitlines()[0]
 
 
+def test_a_fault_in_a_file_with_a_line_end_in_its_name_is_on_one_line(cosmos):
+    Path("a\nb.yaml: ok.yaml").write_text(SCENARIO + "seed: -1\n")
+
+    _, _, faulty = cosmos("validate", "a\nb.yaml: ok.yaml")
+    _, _, missing = cosmos("validate", "c\nd.yaml")
+
+    assert faulty.splitlines()[0] == "a\\nb.yaml: ok.yaml:4:7: seed: expected >= 0, got -1"
+    assert missing.splitlines()[0].startswith("c\\nd.yaml: no such file")
+
+
 def test_validate_shows_the_faults_of_all_files(cosmos):
     Path("b.yaml").write_text(SCENARIO + "sed: 1\n")
     Path("c.yaml").write_text(SCENARIO + "seed: -1\n")
