@@ -91,7 +91,7 @@ class Fault:
     def _where(self) -> str:
         if self.override:
             return f"--set {self.override}"
-        file = self.file.replace("\n", "\\n").replace("\r", "\\r")  # a name's end is no line's
+        file = self.file.replace("\n", "\\n").replace("\r", "\\r")  # a fault stands on one line
         return file if self.line is None else f"{file}:{self.line}:{self.column}"
 
 

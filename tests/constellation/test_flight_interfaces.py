@@ -394,9 +394,19 @@ def test_software_that_never_comes_is_named(tmp_path):
         ({"kind": "serial", "port": "/dev/no-such"}, "serial /dev/no-such: cannot be opened"),
     ],
 )
-def test_an_address_that_cannot_be_is_named(tmp_path, transport, words):
-    with pytest.raises(BlamedError, match=words):
+def test_an_address_that_cannot_be_is_named_and_keeps_no_socket(tmp_path, transport, words):
+    before = open_sockets()
+
+    with pytest.raises(BlamedError, match=words) as held:  # and with it all that its frames hold
         Attached(tmp_path, None, flight=attached(transport)).run(1)
+
+    assert open_sockets() <= before, held.value
+
+
+def open_sockets():
+    """Return the sockets that this process holds."""
+    links = (os.path.realpath(f"/proc/self/fd/{each}") for each in os.listdir("/proc/self/fd"))
+    return {link for link in links if "socket:" in link}
 
 
 def test_a_program_that_ends_before_it_connects_is_named_with_its_end(tmp_path):
