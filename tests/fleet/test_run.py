@@ -118,7 +118,10 @@ def test_detached_run_goes_on_on_boards_and_is_ended_by_its_number(tower: RunTow
     assert refused.returncode == 2
     assert elsewhere.returncode == 2
     assert "its host runs on another computer" in elsewhere.stderr
-    assert (ended.returncode, ended.stdout.count("ended")) == (0, 1), ended.stdout + ended.stderr
+    # Boards whose host is gone end by themselves: whether `down` finds them living is chance.
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert "pi01: ended" in ended.stdout
+    assert not tower.living()
     assert collected.returncode == 0, collected.stderr
     assert tower.document["status"] == "interrupted"
 
