@@ -115,3 +115,4 @@ class FaultableClock(ClockEstimate):
         self.to_host_s = self._to_host_s_when_wrong  # type: ignore[method-assign]  # meant: see above
         self._error_s += (now_s - self._anchor_s) * self._rate
         self._anchor_s = now_s
+        self.changes += 1

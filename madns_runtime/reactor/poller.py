@@ -7,6 +7,7 @@ import math
 import os
 import select
 import selectors
+import sys
 import time
 from time import monotonic
 from typing import Protocol
@@ -20,6 +21,12 @@ FAR_S = 1e9
 """A time of the monotonic clock beyond this, thirty years after the start of the machine, is never."""
 WAIT_S_MAX = 86_400.0
 """The portable poller looks up at least this often: its platform may not take longer timeouts."""
+REPEAT_LATER_S = 3e-6
+"""A timer that repeats is set to fire so much after the first deadline ..."""
+REPEAT_LATER_S_MAX = 8e-6
+"""... and is set anew for one that it would miss by more, or that it would come before."""
+COUNT_BYTES = 8
+"""What a timerfd gives to read: how often it has fired."""
 
 
 class Poller(Protocol):
@@ -27,6 +34,8 @@ class Poller(Protocol):
 
     timer_settings: int
     """How often the kernel's timer was set; 0 without one."""
+    period_s: float
+    """The time from most deadlines to the next, s; 0 for none. Right or wrong, it changes nothing but what waiting costs."""
 
     def register(self, fd: int) -> None:
         """
@@ -66,16 +75,32 @@ class TimerFd:
             self.fd = libc.timerfd_create()
         self._when = libc.Itimerspec()
 
-    def set(self, when_s: float) -> None:
-        """Let the descriptor become readable at *when_s*; beyond FAR_S for never."""
+    def set(self, when_s: float, period_s: float = 0.0) -> None:
+        """
+        Let the descriptor become readable at *when_s*; beyond FAR_S for never.
+
+        Args:
+            when_s: Time of the monotonic clock, s.
+            period_s: It fires again after so long, s, once what it has counted is read; 0 for once only.
+        """
         # Zero would disarm the timer, so a time before the clock's beginning is its first moment.
         when_ns = 0 if when_s > FAR_S else max(1, math.ceil(when_s * NANOSECONDS))
+        period_ns = round(period_s * NANOSECONDS)
         if self._settime_ns is not None:
-            self._settime_ns(self.fd, flags=libc.TFD_TIMER_ABSTIME, initial=when_ns)
+            flags = libc.TFD_TIMER_ABSTIME
+            self._settime_ns(self.fd, flags=flags, initial=when_ns, interval=period_ns)
             return
-        value = self._when.it_value
+        value, interval = self._when.it_value, self._when.it_interval
         value.tv_sec, value.tv_nsec = divmod(when_ns, NANOSECONDS)
+        interval.tv_sec, interval.tv_nsec = divmod(period_ns, NANOSECONDS)
         libc.timerfd_settime(self.fd, self._when)
+
+    def count(self) -> int:
+        """Return how often it has fired since it was set or asked last, and let one that repeats go on."""
+        try:
+            return int.from_bytes(os.read(self.fd, COUNT_BYTES), sys.byteorder)
+        except BlockingIOError:
+            return 0
 
     def close(self) -> None:
         """Close the descriptor."""
@@ -88,14 +113,19 @@ class EpollPoller:
 
     epoll's own timeout is in milliseconds; a timerfd among its descriptors wakes within tens of
     microseconds. It is set only when the deadline changes, and registered edge-triggered, so that it
-    need not be read after it fired.
+    need not be read after it fired. Where deadlines follow each other at a period, it repeats by itself: to read it
+    then takes a quarter of what it takes to set it.
     """
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
         self._timer = TimerFd()
         self._timer_fd = self._timer.fd
-        self._armed_s = math.inf
+        self._fires_s = math.inf
+        """When the timer fires next; not a number while it is to be set first."""
+        self._repeats_s = 0.0
+        """The period that it was set with, s; 0 for once only."""
+        self.period_s = 0.0
         self.timer_settings = 0
         self._epoll.register(self._timer.fd, select.EPOLLIN | select.EPOLLET)
 
@@ -111,21 +141,32 @@ class EpollPoller:
     def wait(self, until_s: float) -> list[int]:
         """Wait for descriptors until *until_s*; see `Poller`."""
         timeout_s = -1.0
-        if until_s != self._armed_s:
+        if until_s != self._fires_s and not (
+            self._repeats_s and 0.0 <= self._fires_s - until_s <= REPEAT_LATER_S_MAX
+        ):
             if until_s <= monotonic():
                 timeout_s = 0.0
             else:
-                self._timer.set(until_s)
-                self.timer_settings += 1
-                self._armed_s = until_s
+                self._set(until_s)
         ready = []
         for fd, _ in self._epoll.poll(timeout_s, EVENTS_MAX):
             if fd == self._timer_fd:
-                # It fired: the same deadline, should it come again, has to be set again.
-                self._armed_s = math.nan
+                self._fired()
             else:
                 ready.append(fd)
         return ready
+
+    def _set(self, until_s: float) -> None:
+        # In whole nanoseconds, as the kernel counts it: what is added up here for hours is what fires there.
+        self._repeats_s = period_s = round(self.period_s, 9) if until_s <= FAR_S else 0.0
+        self._fires_s = until_s + REPEAT_LATER_S if period_s else until_s
+        self._timer.set(self._fires_s, period_s)
+        self.timer_settings += 1
+
+    def _fired(self) -> None:
+        # One that fires once has to be set again even for the same deadline, should that come again.
+        fired = self._timer.count() if self._repeats_s else 0
+        self._fires_s = self._fires_s + fired * self._repeats_s if fired else math.nan
 
     def close(self) -> None:
         """Close epoll and timer."""
@@ -139,6 +180,7 @@ class SelectorPoller:
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
         self.timer_settings = 0
+        self.period_s = 0.0
 
     def register(self, fd: int) -> None:
         """Watch *fd*; see `Poller`."""

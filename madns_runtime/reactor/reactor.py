@@ -139,6 +139,10 @@ class Reactor:
         """How often the kernel's timer was set."""
         return self._poller.timer_settings
 
+    def expect_period(self, period_s: float) -> None:
+        """Take note that most of its timers' deadlines will follow each other after so long, s: waiting costs less then."""
+        self._poller.period_s = period_s
+
     def add_reader(self, fd: int, callback: Callback) -> None:
         """
         Call *callback* whenever *fd* is readable or its peer is gone; replaces an earlier callback.

@@ -101,6 +101,8 @@ class AgentProcess:
             pack = Pack(phase_s, reactor=self._reactor, process=process)
             self._packs |= dict.fromkeys(names, pack)
             process.arms.append(pack.arm)
+        if len(process.arms) == 1:
+            self._reactor.expect_period(1.0 / self._launch.config.agents.tick_hz)
         return [self._make_runner(seat) for seat in self._seats]
 
     def _make_runner(self, seat: LoopSeat) -> AgentRunner:

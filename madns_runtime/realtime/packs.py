@@ -60,6 +60,9 @@ class Pack:
             process.after_packet = self._answered
         self._next: tuple[PackMember, float] | None = None
         """Whose tick it wakes for, and when that is due, s of simulated time."""
+        self._due_s = math.inf
+        """When that is on the local clock, s, as the clock was after so many changes."""
+        self._clock_changes = 0
         # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, self._due)
 
@@ -83,7 +86,9 @@ class Pack:
             self._timer.reschedule(math.inf)
         else:
             self._next = first, earliest_s
-            self._timer.reschedule(first.local_s(earliest_s) - self._lead.lead_s)
+            self._clock_changes = self._process.clock.changes
+            self._due_s = due_s = first.local_s(earliest_s)
+            self._timer.reschedule(due_s - self._lead.lead_s)
 
     def _due(self) -> None:
         members, process = self._members, self._process
@@ -122,9 +127,11 @@ class Pack:
             self._lead.learn(now_s - ordered_s)
         if self._next is None:
             return
-        member, deadline_s = self._next
-        # By the clock as it is estimated now: a tick that is a little early would cost another wake-up.
-        until_s = min(member.local_s(deadline_s), ordered_s + WAIT_S_MAX)
+        if self._process.clock.changes != self._clock_changes:
+            # By the clock as it is estimated now: a tick that is a little early would cost another wake-up.
+            member, deadline_s = self._next
+            self._due_s = member.local_s(deadline_s)
+        until_s = min(self._due_s, ordered_s + WAIT_S_MAX)
         while now_s < until_s:
             now_s = monotonic()
 

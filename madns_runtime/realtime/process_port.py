@@ -75,6 +75,8 @@ class ProcessPort:
         self._is_open = False
         self._is_frozen = False
         self._takers: dict[int, Callable[[bytes], None]] = {}
+        self._only: Callable[[bytes], None] | None = None
+        """Takes whatever comes, of a process that is one agent's."""
         self._refusals: dict[int, Callable[[str], None]] = {}
         self._left: set[int] = set()
         """Agents that have ended here: the host sends to them until it knows."""
@@ -137,11 +139,13 @@ class ProcessPort:
             self._is_open = True
             self._reactor.add_reader(self.socket.fileno(), self._readable)
         self._takers[agent_index], self._refusals[agent_index] = take, refuse
+        self._only = take if self.agents == 1 else None
         self._left.discard(agent_index)
 
     def leave(self, agent_index: int) -> None:
         """Listen for an agent no more; the last one closes the socket."""
         self._takers.pop(agent_index, None)
+        self._only = None
         self._refusals.pop(agent_index, None)
         self._left.add(agent_index)
         self.close_if_unused()
@@ -174,7 +178,10 @@ class ProcessPort:
     def _deal_out(self, packet: bytes) -> None:
         datagrams = split(packet) if is_bundle(packet) else None
         if datagrams is None:
-            self._give(packet)
+            if self._only is None:
+                self._give(packet)
+            else:
+                self._only(packet)
             return
         self.begin()
         try:

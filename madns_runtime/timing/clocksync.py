@@ -144,6 +144,8 @@ class ClockEstimate:
         """Exchanges whose timestamps cannot be: cause after effect, or not finite."""
         self.steps = 0
         """Steps of either clock that were detected."""
+        self.changes = 0
+        """How often what is served has changed: between two changes a time of one clock is the same of the other."""
 
     @property
     def is_valid(self) -> bool:
@@ -312,6 +314,7 @@ class ClockEstimate:
         anchor_s = max(now_s, min(self._asked_s, now_s + QUERY_AHEAD_S_MAX))
         wanted_s = line.at(anchor_s)
         before = self._served
+        self.changes += 1
         offset_s = wanted_s if before is None else before.offset_at(anchor_s)
         correction_s = wanted_s - offset_s
         if self.exchanges <= EXCHANGES_MIN or (may_jump_ahead and correction_s > 0):

@@ -1,4 +1,5 @@
 import gc
+import math
 import os
 import signal
 import socket
@@ -548,7 +549,7 @@ def test_timer_is_set_in_the_kernel_only_when_the_earliest_deadline_changes(monk
     calls = []
     real_set = TimerFd.set
     monkeypatch.setattr(
-        TimerFd, "set", lambda self, when_s: (calls.append(when_s), real_set(self, when_s))
+        TimerFd, "set", lambda self, *times: (calls.append(times), real_set(self, *times))
     )
     reactor = Reactor()
     left, right = socket.socketpair()
@@ -573,7 +574,7 @@ def test_timer_is_set_in_the_kernel_only_when_the_earliest_deadline_changes(monk
     reactor.run()
 
     assert wakeups == 50
-    assert calls == [first_s]
+    assert calls == [(first_s, 0.0)]
     reactor.close()
     left.close()
     right.close()
@@ -590,7 +591,7 @@ def test_timerfd_of_newer_pythons_is_used_where_present(monkeypatch):
     monkeypatch.setattr(
         os,
         "timerfd_settime_ns",
-        lambda fd, *, flags, initial: asked.append((flags, initial)),
+        lambda fd, *, flags, initial, interval: asked.append((flags, initial, interval)),
         raising=False,
     )
 
@@ -598,10 +599,16 @@ def test_timerfd_of_newer_pythons_is_used_where_present(monkeypatch):
     timer.set(1.5)
     timer.set(-1.0)
     timer.set(float("inf"))
+    timer.set(1.5, 0.01)
     timer.close()
 
     assert asked[0] == (time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
-    assert asked[1:] == [(1, 1_500_000_000), (1, 1), (1, 0)]
+    assert asked[1:] == [
+        (1, 1_500_000_000, 0),
+        (1, 1, 0),
+        (1, 0, 0),
+        (1, 1_500_000_000, 10_000_000),
+    ]
 
 
 def test_many_ready_descriptors_all_get_their_turn(monkeypatch):
@@ -637,4 +644,74 @@ def test_poller_reports_nothing_when_its_deadline_has_passed():
 
     assert poller.wait(0.0) == []
     assert poller.wait(time.monotonic() + 0.005) == []
+    poller.close()
+
+
+PERIOD_S = 0.002
+
+
+def deadlines(poller, first_s, count, period_s=PERIOD_S):
+    """Wait for so many deadlines, one after the other; return by how much each was returned from too early, s."""
+    early_s = []
+    for number in range(count):
+        until_s = first_s + number * period_s
+        while (now_s := time.monotonic()) < until_s:
+            assert poller.wait(until_s) == []
+        early_s.append(until_s - now_s)
+    return early_s
+
+
+def test_deadlines_at_a_period_are_all_met_by_a_timer_that_repeats():
+    poller = EpollPoller()
+    poller.period_s = PERIOD_S
+
+    early_s = deadlines(poller, time.monotonic() + PERIOD_S, 100)
+
+    assert max(early_s) <= 0.0
+    # Once, and again only where this loop itself slept through a deadline.
+    assert poller.timer_settings <= 1 + sum(-late_s > PERIOD_S / 2 for late_s in early_s)
+    poller.close()
+
+
+def test_deadlines_that_leave_the_period_are_met_as_well():
+    poller = EpollPoller()
+    poller.period_s = PERIOD_S
+    now_s = time.monotonic()
+
+    early_s = deadlines(poller, now_s + PERIOD_S, 10)
+    early_s += deadlines(poller, time.monotonic() + 0.3 * PERIOD_S, 10, 1.7 * PERIOD_S)
+    early_s += deadlines(poller, time.monotonic() + 0.9 * PERIOD_S, 10, PERIOD_S + 20e-6)
+
+    assert max(early_s) <= 0.0
+    poller.close()
+
+
+def test_a_timer_that_repeats_wakes_nobody_who_waits_for_something_else():
+    poller = EpollPoller()
+    poller.period_s = PERIOD_S
+    deadlines(poller, time.monotonic() + PERIOD_S, 5)
+    reader, writer = os.pipe()
+    poller.register(reader)
+    threading.Timer(20 * PERIOD_S, os.write, (writer, b"x")).start()
+
+    ready = poller.wait(math.inf)
+
+    assert ready == [reader]
+    poller.close()
+    os.close(reader)
+    os.close(writer)
+
+
+def test_periods_that_were_slept_through_are_counted_by_the_timer():
+    poller = EpollPoller()
+    poller.period_s = PERIOD_S
+    first_s = time.monotonic() + PERIOD_S
+    deadlines(poller, first_s, 1)
+    time.sleep(5.5 * PERIOD_S)
+
+    late_s = time.monotonic() - first_s
+    following_s = first_s + math.ceil(late_s / PERIOD_S) * PERIOD_S
+    early_s = deadlines(poller, following_s, 5)
+
+    assert max(early_s) <= 0.0
     poller.close()

@@ -72,7 +72,11 @@ class Member:
 
 
 PROCESS = SimpleNamespace(
-    agents=8, begin=int, end=int, account=SimpleNamespace(begin_ticks=lambda now_s: None)
+    agents=8,
+    begin=int,
+    end=int,
+    account=SimpleNamespace(begin_ticks=lambda now_s: None),
+    clock=SimpleNamespace(changes=0),
 )
 ALONE = SimpleNamespace(**{**vars(PROCESS), "agents": 1})
 
@@ -198,14 +202,18 @@ def test_it_wakes_ahead_of_its_deadline_by_what_waking_takes_and_ticks_at_it(mon
 
 def test_it_waits_for_a_deadline_that_a_better_clock_has_moved_but_not_for_long(monkeypatch):
     clock = Clock(monkeypatch, 100.0, 1e-7)
+    estimate = SimpleNamespace(changes=0)
+    process = SimpleNamespace(**{**vars(PROCESS), "clock": estimate})
     member = Observer(1.0, clock)
-    loop, pack = pack_of(member)
+    loop, pack = pack_of(member, process=process)
     pack.arm()
     monkeypatch.setattr(member, "local_s", lambda t_s: 100.00005 + t_s)
+    estimate.changes += 1
     wake(loop, clock, took_s=10e-6)
     assert member.ticked_s == [pytest.approx(101.00005, abs=1e-6)]
 
     monkeypatch.setattr(member, "local_s", lambda t_s: 107.0 + t_s)
+    estimate.changes += 1
     wake(loop, clock, took_s=10e-6)
     assert member.ticked_s[1] - loop.sleeps[-1][1] < WAIT_S_MAX
 

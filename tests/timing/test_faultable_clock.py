@@ -92,3 +92,33 @@ def test_a_drift_goes_on_while_it_is_a_fault_of_another_agent_of_the_process(clo
 def test_a_clock_that_nobody_put_wrong_shows_the_time(clock):
     assert clock.wrong_s(1234.5678) == 1234.5678
     assert clock.steps == 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda clock: clock.step(1, 0.2, 20.0),
+        lambda clock: clock.drift(1, 50.0, 20.0),
+        lambda clock: clock.add_exchange(20.0, 1020.0004, 1020.0004, 20.0005),
+        lambda clock: clock.settle(20.0, is_unused=True),
+    ],
+    ids=["step", "drift", "exchange", "settling"],
+)
+def test_a_time_of_the_host_is_the_same_local_time_until_a_change_is_counted(clock, change):
+    known = clock.changes
+    before_s = clock.to_local_s(HOST_AHEAD_S + 30.0)
+    clock.to_host_s(20.0)
+    assert clock.changes == known
+
+    change(clock)
+
+    assert clock.changes == known + 1
+    assert clock.to_local_s(HOST_AHEAD_S + 30.0) != before_s
+
+
+def test_the_end_of_a_drift_is_a_change(clock):
+    clock.drift(1, 50.0, 20.0)
+    known = clock.changes
+
+    assert clock.end_drift(1, 25.0)
+    assert clock.changes == known + 1
