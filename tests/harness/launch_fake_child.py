@@ -130,14 +130,15 @@ def finish(line: Line, directory: str, told: dict) -> None:
 
 
 def agents(line: Line) -> int:
-    launch, _ = line.launch()
+    launch, pending = line.launch()  # a run that is over meanwhile tells its stop with the launch
     note(f"launched {json.dumps(launch['agents'])} {launch['machine']} port {launch['host_port']}")
     for index, name in enumerate(launch["agents"]):
         line.say("started", agent=name, pid=1000 + index, incarnation=1)
     started_s = time.monotonic()
     exited = False
     while True:
-        commands = line.commands(0.05)
+        commands = pending + line.commands(0 if pending else 0.05)
+        pending = []
         if line.is_gone and not FAKE.get("ignores_life_line"):
             note("life line gone")
             return 1
