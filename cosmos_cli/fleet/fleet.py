@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.pool import FORKS_DEFAULT, for_each
@@ -80,12 +81,16 @@ class Fleet:
         """Do the same without asking what the inventory says beyond how to reach the machines; *on_wait* as `for_each`."""
         lock = threading.Lock()
         living: set[Connection] = set()
+        is_over = False
 
         def work(target: Target) -> T:
             connection = connect(target, self.options)
             with lock:
                 living.add(connection)
+                is_late = is_over
             try:
+                if is_late:  # it came when the others had been closed
+                    raise MachineFailure(FailureKind.LOST, "the command was interrupted")
                 return task(connection)
             finally:
                 with lock:
@@ -96,6 +101,7 @@ class Fleet:
             return for_each(self.targets, work, forks=self.forks, on_done=on_done, on_wait=on_wait)
         finally:  # of a command that is interrupted some are open
             with lock:
+                is_over = True
                 left = list(living)
             for connection in left:
                 connection.close()

@@ -5,6 +5,7 @@ import threading
 from typing import get_args
 
 import pytest
+from harness.waiting import wait_until
 
 from cosmos_cli.fleet import fleet as module
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -61,7 +62,10 @@ def test_every_connection_is_closed_whatever_its_task_did(connections):
 
 
 def test_interrupt_closes_what_is_open_so_that_what_runs_there_ends(connections):
+    both = threading.Barrier(2)
+
     def task(connection):
+        both.wait(WAIT_S)
         if connection.target.name == "pi1":
             _thread.interrupt_main()
         assert connection.closed.wait(WAIT_S)
@@ -70,6 +74,34 @@ def test_interrupt_closes_what_is_open_so_that_what_runs_there_ends(connections)
         Fleet(targets=TARGETS[:2]).each_target(task)
 
     assert all(connection.closed.is_set() for connection in connections.values())
+
+
+def test_connection_that_opens_after_an_interrupt_is_closed_and_nothing_is_done_there(
+    connections, monkeypatch
+):
+    connect, is_interrupted, late = module.connect, threading.Event(), []
+
+    def connect_late(target, options):
+        if target.name == "pi0":
+            assert is_interrupted.wait(WAIT_S)
+            late.append(connect(target, options))
+            return late[0]
+        return connect(target, options)
+
+    def task(connection):
+        done.append(connection.target.name)
+        if connection.target.name == "pi1":
+            _thread.interrupt_main()
+        assert connection.closed.wait(WAIT_S)
+
+    done = []
+    monkeypatch.setattr(module, "connect", connect_late)
+    with pytest.raises(KeyboardInterrupt):
+        Fleet(targets=TARGETS[:2]).each_target(task)
+    is_interrupted.set()
+
+    wait_until(lambda: late and late[0].closed.is_set(), "end of the connection")
+    assert done == ["pi1"]
 
 
 def test_task_is_given_what_the_inventory_says_of_its_machine(connections, tmp_path):
