@@ -29,12 +29,17 @@ class MachineWaits:
 
     def between(self, begin_s, end_s):
         """Return the waits between two moments of the monotonic clock, s; each is its share in between."""
+        # One that still goes on is not among them yet: who asks may have been let run first.
+        while self._thread.is_alive() and not (self._waits and self._waits[-1][1] >= end_s):
+            time.sleep(NAP_S)
         return sum(
             max(0.0, min(woken_s, end_s) - max(due_s, begin_s)) for due_s, woken_s in self._waits
         )
 
     def _nap(self):
+        woken_s = time.monotonic()
         while not self._is_over.is_set():
-            due_s = time.monotonic() + NAP_S
+            due_s = woken_s + NAP_S  # what comes between two naps is a wait, too
             time.sleep(NAP_S)
-            self._waits.append((due_s, time.monotonic()))
+            woken_s = time.monotonic()
+            self._waits.append((due_s, woken_s))
