@@ -2,7 +2,8 @@
 A stand-in for host and supervisor that speaks the operator's protocol and misbehaves as told.
 
 How it behaves stands in COSMOS_FAKE, a JSON object: {"host": {...}, "agents": {...}}. A host runs for runs_s, or
-until something is noted in COSMOS_FAKE_NOTES (runs_until): what must have happened by then takes as long as it takes.
+until something is noted in COSMOS_FAKE_NOTES (runs_until), and an agent is killed likewise (agent_killed_after_s,
+agent_killed_on): what must have happened by then takes as long as it takes.
 """
 
 from __future__ import annotations
@@ -64,6 +65,12 @@ def is_noted(text: str) -> bool:
 
 def is_over(t_s: float) -> bool:
     return is_noted(FAKE["runs_until"]) if "runs_until" in FAKE else t_s >= FAKE.get("runs_s", 0.3)
+
+
+def is_agent_killed(t_s: float) -> bool:
+    if "agent_killed_on" in FAKE:
+        return is_noted(FAKE["agent_killed_on"])
+    return FAKE.get("agent_killed_after_s", 1e9) < t_s
 
 
 def host(line: Line) -> int:
@@ -145,7 +152,7 @@ def agents(line: Line) -> int:
         if line.is_gone:
             time.sleep(0.05)
         t_s = time.monotonic() - started_s
-        if FAKE.get("agent_killed_after_s", 1e9) < t_s and not exited:
+        if not exited and is_agent_killed(t_s):
             exited = True
             values = {"agent": launch["agents"][0], "pid": 1000, "code": None, "signal": "SIGKILL"}
             line.say("exited", **values, how="killed by SIGKILL", will_restart=False)

@@ -182,12 +182,13 @@ def test_killed_host_is_reported_with_its_last_words_and_supervisors_are_stopped
 
 
 def test_operator_that_was_stopped_says_so_and_what_it_costs(launched: Launched) -> None:
-    launched.start(host={"runs_s": 5}, constants={"operator.STALL_S": 1.5})
+    launched.start(host={"runs_until": "went on"}, constants={"operator.STALL_S": 1.5})
     launched.wait_for_note("launched [")
 
     launched.signal(signal.SIGSTOP)
     time.sleep(1.6)  # for longer than STALL_S
     launched.signal(signal.SIGCONT)
+    launched.note("went on")
     outcome = launched.outcome()
 
     assert texts(outcome) == []  # it came to its end all the same
@@ -198,7 +199,7 @@ def test_operator_that_was_stopped_says_so_and_what_it_costs(launched: Launched)
 def test_verdict_of_a_failed_run_hears_that_its_operator_was_stopped(launched: Launched) -> None:
     launched.start(
         host={"runs_s": 60},
-        agents={"agent_killed_after_s": 5},
+        agents={"agent_killed_on": "went on"},
         constants={"operator.STALL_S": 1.5},
     )
     launched.wait_for_note("launched [")
@@ -206,6 +207,7 @@ def test_verdict_of_a_failed_run_hears_that_its_operator_was_stopped(launched: L
     launched.signal(signal.SIGSTOP)
     time.sleep(1.6)  # for longer than STALL_S
     launched.signal(signal.SIGCONT)
+    launched.note("went on")
     outcome = launched.outcome()
 
     assert outcome["host_result"]["status"] == "failed"
@@ -434,7 +436,7 @@ def test_children_end_by_themselves_when_the_operator_is_killed(launched: Launch
 
 
 def test_program_that_cannot_be_started_ends_the_run_and_is_named(launched: Launched) -> None:
-    launched.start(constants={"child.AGENT_PROGRAM": ["/nonexistent/python"]})
+    launched.start(host={"runs_s": 60}, constants={"child.AGENT_PROGRAM": ["/nonexistent/python"]})
 
     outcome = launched.outcome()
 
