@@ -8,9 +8,11 @@ import subprocess
 import time
 
 import pytest
+from harness.waiting import is_alive, wait_until
 from ssh_harness import needs_sshd, target_of
 from sshd import Sshd
 
+from cosmos_cli.fleet import helper
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.local import LocalConnection
@@ -61,6 +63,7 @@ def test_signal_that_ends_it_is_told(connection, is_here):
     local = LocalConnection(Target(name="here", address="127.0.0.1", connection="local"))
     with Helper.start(local if is_here else connection) as board:
         os.kill(board.greeting["pid"], signal.SIGKILL)
+        wait_until(lambda: not is_alive(board.greeting["pid"]), "end of the helper")
         with pytest.raises(MachineFailure) as caught:
             board.call("lock", {"path": "/nowhere"})
 
@@ -122,9 +125,10 @@ def test_start_up_file_that_talks_is_told(own_sshd, known_hosts):
 
 @pytest.mark.parametrize("ends", ["sleep 2; exit 1", "exec >&- 2>&-; sleep 2; exit 1"])
 def test_account_without_commands_on_a_busy_board_is_told_though_it_ends_late(
-    tmp_path, known_hosts, ends
+    tmp_path, known_hosts, monkeypatch, ends
 ):
     needs_sshd()
+    monkeypatch.setattr(helper, "LAST_WORDS_S", 60.0)  # this computer may be busy as well
     says = "This account is currently not available."
     with Sshd(tmp_path / "nologin", extra=f"ForceCommand echo {says}; {ends}") as server:
         known_hosts.write_text(server.known_hosts_line())
