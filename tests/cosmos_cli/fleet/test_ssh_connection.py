@@ -11,6 +11,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from harness.ports import free_port
@@ -21,6 +22,7 @@ from sshd import Sshd, make_key, public, silent_server
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.open_connection import connect
+from cosmos_cli.fleet.ssh import connect as attempts_module
 from cosmos_cli.fleet.ssh import connection as connection_module
 from cosmos_cli.fleet.ssh.transport import SshTransport
 from cosmos_cli.fleet.target import Target
@@ -207,6 +209,8 @@ def test_no_more_than_three_keys_are_tried(own_sshd, home, known_hosts, tmp_path
         connect(target_of(own_sshd, key_file=None))
 
     assert "no more than 3 keys are tried" in caught.value.text
+    # Its server answers before it writes down what it has answered.
+    wait_until(lambda: not own_sshd.sessions(), "end of the session")
     assert own_sshd.log.read_text().count("Failed publickey") == 3
 
 
@@ -241,13 +245,21 @@ def agent(monkeypatch, tmp_path):
     process = subprocess.Popen(
         ["ssh-agent", "-D", "-a", socket_file], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
-    wait_until(lambda: os.path.exists(socket_file), "a socket of the agent", process=process)
+    wait_until(lambda: answers(socket_file), "a socket of the agent", process=process)
     monkeypatch.setenv("SSH_AUTH_SOCK", socket_file)
     yield lambda key, **more: subprocess.run(
         ["ssh-add", "-q", str(key)], check=True, stdin=subprocess.DEVNULL, **more
     )
     process.terminate()
     process.wait()
+
+
+def answers(socket_file):
+    """Whether somebody listens there: the file is there a moment before."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as sock:
+        sock.connect(socket_file)
+        return True
+    return False
 
 
 def test_key_in_the_ssh_agent_is_used_by_many_threads(known, agent):
@@ -309,17 +321,25 @@ def test_port_without_a_server_is_refused(known):
     assert "connection refused" in caught.value.text
 
 
-def test_server_that_starts_meanwhile_is_reached_in_a_further_attempt(tmp_path, known_hosts):
+def test_server_that_starts_meanwhile_is_reached_in_a_further_attempt(
+    tmp_path, known_hosts, monkeypatch
+):
     needs_sshd()
     server = Sshd(tmp_path / "late")
     known_hosts.write_text(server.known_hosts_line())
-    starter = threading.Timer(0.4, server.__enter__)
-    starter.start()
-    try:
+    with contextlib.ExitStack() as stack:
+        pauses_s = []
+
+        def pause(seconds):
+            if not pauses_s:
+                stack.enter_context(server)
+            pauses_s.append(seconds)
+
+        clock = SimpleNamespace(monotonic=time.monotonic, sleep=pause)
+        monkeypatch.setattr(attempts_module, "time", clock)
         assert says(target_of(server)) == b"hello\n"
-    finally:
-        starter.join()
-        server.__exit__()
+
+    assert pauses_s == [attempts_module.PAUSES_S[0]]
 
 
 def test_silent_server_is_frozen_and_costs_no_more_than_the_deadline():
