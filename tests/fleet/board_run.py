@@ -71,7 +71,7 @@ class BoardRun:
         self.run.plan_json.write_text(json.dumps(plan))
 
     def _copy_to(self, name: str) -> None:
-        command = f"mkdir -p {self.directory} && tar -x -C {self.directory} && sync"
+        command = f"mkdir -p {self.directory} && tar -x -C {self.directory} && sync -f ."
         ssh = ["ssh", "-F", str(self.tower.ssh_config), name, command]
         with subprocess.Popen(ssh, stdin=subprocess.PIPE) as process:
             assert process.stdin is not None

@@ -92,7 +92,7 @@ def test_board_that_starts_anew_in_the_midst_of_a_large_file_is_collected_whole(
     tower8, tmp_path, fault
 ):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
-    tower8.run("pi01", "sync")
+    tower8.run("pi01", "sync -f .")
     process = run.cosmos.start("collect")
     wait_for_part(run, 2_000_000)
     restart(tower8, "pi01", fault)

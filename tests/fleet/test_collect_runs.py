@@ -92,7 +92,7 @@ def test_board_whose_disk_fills_during_a_run_is_named_and_its_records_are_cut_wh
 def test_board_whose_card_fails_during_a_run_is_named_and_keeps_what_it_has(operator):
     process = operator.start("worn", 6)
     boots = operator.tower.state()["boards"]["pi01"]["boots"]
-    operator.tower.run("pi01", "sync")  # else a busy computer's card may not have the folder yet
+    operator.tower.run("pi01", "sync -f .")  # else a busy computer's card may not have the folder yet
     try:
         operator.tower.fault("pi01", "ro")
         _, talk = process.communicate(timeout=PATIENCE_S)
@@ -122,7 +122,7 @@ def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator)
     own = [entry["pid"] for entry in operator.living() if entry["role"] in ("operator", "host")]
     assert process.pid in own
     for name in ("pi01", "pi02"):
-        operator.tower.run(name, "sync")  # else the kernel keeps the records for half a minute
+        operator.tower.run(name, "sync -f .")  # else the kernel keeps the records for half a minute
     # Nobody notices that the first is gone, and ends the run in good order on the second.
     for pid in own:
         os.kill(pid, signal.SIGSTOP)

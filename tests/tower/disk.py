@@ -108,7 +108,7 @@ class Disk:
     def fill(self, free_bytes: int = 0) -> None:
         """Leave only *free_bytes* of room."""
         self.remove_ballast()
-        os.sync()
+        kernel.sync(self.mount_point)
         for _ in range(3):  # block maps take room of their own
             state = os.statvfs(self.mount_point)
             size = state.f_bavail * state.f_frsize - free_bytes

@@ -127,6 +127,15 @@ def lose_power(disk: Path) -> None:
         os.close(descriptor)
 
 
+def sync(disk: Path) -> None:
+    """Write what this file system has not written yet, and leave other boards' to themselves, as `sync` would not."""
+    descriptor = os.open(disk, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        _check(_libc.syncfs(descriptor), "syncfs")
+    finally:
+        os.close(descriptor)
+
+
 def trim(disk: Path) -> None:
     """Give back what a file system's deleted files take on its medium."""
     descriptor = os.open(disk, os.O_RDONLY | os.O_CLOEXEC)

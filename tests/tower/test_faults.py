@@ -161,7 +161,7 @@ def test_power_cut_ends_a_board_without_a_goodbye_and_it_comes_back(tower8):
 
 def test_power_cut_loses_what_was_not_synced(tower8):
     boots = tower8.state()["boards"]["pi05"]["boots"]
-    tower8.run("pi05", "echo a > synced; sync; echo b > unsynced")
+    tower8.run("pi05", "echo a > synced; sync -f .; echo b > unsynced")
 
     tower8.fault("pi05", "crash")
     tower8.wait_until_on("pi05", boots + 1)
@@ -172,7 +172,7 @@ def test_power_cut_loses_what_was_not_synced(tower8):
 
 def test_power_cut_brings_back_whole_what_was_deleted_and_not_synced(tower8):
     boots = tower8.state()["boards"]["pi05"]["boots"]
-    tower8.run("pi05", "mkdir -p d/e && yes | head -c 100K > d/e/f && sync && rm -r d")
+    tower8.run("pi05", "mkdir -p d/e && yes | head -c 100K > d/e/f && sync -f . && rm -r d")
 
     tower8.fault("pi05", "crash")
     tower8.wait_until_on("pi05", boots + 1)
@@ -201,7 +201,7 @@ def test_power_stays_off_until_it_is_on(tower8):
 
 
 def test_full_disk_refuses_to_write_and_has_room_again(tower8):
-    write = "head -c 3M /dev/zero > big && sync"
+    write = "head -c 3M /dev/zero > big && sync -f ."
     tower8.fault("pi07", "fill", 1024)
     assert "No space left" in is_refused(tower8, "pi07", write)
     tower8.run("pi07", "rm big; head -c 500K /dev/zero > small")
@@ -221,7 +221,7 @@ def test_disk_is_read_only_and_writable_again(tower8):
 
 def test_disk_fails_under_open_files_until_the_next_boot(tower8):
     boots = tower8.state()["boards"]["pi08"]["boots"]
-    tower8.run("pi08", "echo kept > note; sync")
+    tower8.run("pi08", "echo kept > note; sync -f .")
     writer = start(tower8, "pi08", "exec 3> open; echo here; cat >&3 && echo more >&3; cat note")
     assert writer.stdout is not None and writer.stdout.readline() == "here\n"
 

@@ -49,7 +49,7 @@ def test_32_bit_board_has_the_distributions_packages(tower):
 
 
 def test_foreign_board_reboots(tower):
-    tower.run("arm64", "echo kept > note; sync; sudo reboot", check=False)
+    tower.run("arm64", "echo kept > note; sync -f .; sudo reboot", check=False)
     tower.wait_until_on("arm64", 2)
     assert tower.run("arm64", "cat note").stdout == "kept\n"
 

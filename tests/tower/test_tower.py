@@ -190,7 +190,7 @@ def test_services_are_enabled_started_and_started_again_by_a_boot(make_tower):
 
 def test_reboot_keeps_the_disk_and_begins_anew_in_all_else(tower):
     before = tower.state()["boards"]["pi02"]
-    tower.run("pi02", "echo kept > note; touch /tmp/gone; sudo touch /run/gone; sync")
+    tower.run("pi02", "echo kept > note; touch /tmp/gone; sudo touch /run/gone; sync -f .")
 
     started_s = time.monotonic()
     tower.run("pi02", "sudo reboot", check=False)
