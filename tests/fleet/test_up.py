@@ -138,8 +138,9 @@ def test_settings_are_made_and_put_back(fleet):
 def test_settings_are_made_again_after_a_restart(fleet):
     fleet.write(boards=["pi01"], **SETTINGS)
     fleet.up()
+    boots = fleet.tower.state()["boards"]["pi01"]["boots"]
     fleet.tower.fault("pi01", "reboot")
-    fleet.tower.wait_until_on("pi01", boots=fleet.tower.state()["boards"]["pi01"]["boots"] + 1)
+    fleet.tower.wait_until_on("pi01", boots=boots + 1)
 
     again = fleet.up()
 
