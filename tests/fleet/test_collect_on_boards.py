@@ -1,5 +1,6 @@
 """`cosmos collect` over real SSH from virtual boards, with everything that can go wrong with them."""
 
+import contextlib
 import os
 import signal
 import time
@@ -10,7 +11,10 @@ from board_run import PATIENCE_S, BoardRun
 pytestmark = pytest.mark.root
 
 LARGE_BYTES = 40_000_000
-HOLD_OPEN = "nohup sh -c 'exec 9>>{path}; exec sleep 600' >/dev/null 2>&1 & sleep 0.2"
+HOLD_OPEN = (
+    "nohup sh -c 'exec 9>>{path}; touch /dev/shm/held; exec sleep 600' >/dev/null 2>&1 &"
+    " until test -e /dev/shm/held; do sleep 0.05; done"
+)
 
 
 def wait_for_part(run, size_bytes):
@@ -18,9 +22,10 @@ def wait_for_part(run, size_bytes):
     incoming = run.run.path / ".incoming/pi01"
     until_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < until_s:
-        sizes = [part.stat().st_size for part in incoming.glob("*.part")]
-        if max(sizes, default=0) >= size_bytes:
-            return
+        for part in incoming.glob("*.part"):
+            with contextlib.suppress(FileNotFoundError):  # it has come whole since it was listed
+                if part.stat().st_size >= size_bytes:
+                    return
         time.sleep(0.002)
     raise AssertionError(f"no part of {size_bytes} bytes came")
 
