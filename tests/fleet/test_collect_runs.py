@@ -13,6 +13,8 @@ from tower.fixtures import need_tower
 pytestmark = pytest.mark.root
 
 PATIENCE_S = 120.0
+ENDLESS_S = 600
+"""Of a run that ends by what happens to it, or by a word, however long that takes to come."""
 SCENARIO = """
 name: fleet
 simulation: counter
@@ -46,6 +48,12 @@ class Operator:
                 return process
         raise AssertionError(f"it did not start: {''.join(heard)}")
 
+    def stop(self, process):
+        """End a run in good order, and return what it has said: what had to happen in it has happened."""
+        stopped = self.cosmos("inject", "last", "run", "stop")
+        assert stopped.returncode == 0, stopped.stdout + stopped.stderr
+        return process.communicate(timeout=PATIENCE_S)[1]
+
     def last_run(self):
         return max((self.folder / "runs").glob("[0-9]*/run.json")).parent
 
@@ -73,11 +81,12 @@ def operator(tmp_path_factory):
 def test_board_whose_disk_fills_during_a_run_is_named_and_its_records_are_cut_where_they_end(
     operator,
 ):
-    process = operator.start("full", 8)
+    process = operator.start("full", ENDLESS_S)
     time.sleep(3.0)  # so that there is something to cut
     operator.tower.fault("pi01", "fill")
+    time.sleep(5.0)  # so that there is more than the last blocks of the files hold
 
-    _, talk = process.communicate(timeout=PATIENCE_S)
+    talk = operator.stop(process)
     operator.tower.fault("pi01", "unfill")
 
     assert process.returncode == 5, talk
@@ -90,12 +99,14 @@ def test_board_whose_disk_fills_during_a_run_is_named_and_its_records_are_cut_wh
 
 
 def test_board_whose_card_fails_during_a_run_is_named_and_keeps_what_it_has(operator):
-    process = operator.start("worn", 6)
+    process = operator.start("worn", ENDLESS_S)
     boots = operator.tower.state()["boards"]["pi01"]["boots"]
-    operator.tower.run("pi01", "sync -f .")  # else a busy computer's card may not have the folder yet
+    operator.tower.run(
+        "pi01", "sync -f ."
+    )  # else a busy computer's card may not have the folder yet
     try:
         operator.tower.fault("pi01", "ro")
-        _, talk = process.communicate(timeout=PATIENCE_S)
+        talk = operator.stop(process)
 
         assert process.returncode == 5, talk
         assert {"agent-01", "agent-02"} <= operator.named() <= {"agent-01", "agent-02", "pi01"}
@@ -116,7 +127,7 @@ def test_board_whose_card_fails_during_a_run_is_named_and_keeps_what_it_has(oper
 
 
 def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator):
-    process = operator.start("power", 60)
+    process = operator.start("power", ENDLESS_S)
     time.sleep(3.0)
     boots = {name: board["boots"] for name, board in operator.tower.state()["boards"].items()}
     own = [entry["pid"] for entry in operator.living() if entry["role"] in ("operator", "host")]
