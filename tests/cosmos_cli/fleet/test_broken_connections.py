@@ -76,6 +76,11 @@ class BoardsOverSsh:
         assert self.process is not None
         return self.process.wait(PATIENCE_S)
 
+    def interrupt(self) -> None:
+        """End the run: what had to happen in it has happened, however long it took."""
+        assert self.process is not None
+        self.process.send_signal(signal.SIGINT)
+
     @property
     def talk(self) -> str:
         return self.talk_file.read_text()
@@ -141,7 +146,11 @@ def test_run_goes_on_when_all_its_connections_break_again_and_again(
 def test_agent_that_dies_while_the_connection_is_broken_is_told_afterwards(
     boards: BoardsOverSsh,
 ) -> None:
-    boards.start(on_agent_loss="continue", agents={"count": 2, "tick_hz": 10, "restarts_max": 1})
+    boards.start(
+        on_agent_loss="continue",
+        agents={"count": 2, "tick_hz": 10, "restarts_max": 1},
+        time={"duration_s": 600, "rtf_tolerance": 0.9},
+    )
     boards.wait_until_running()
     (agent,) = [
         json.loads(path.read_text())["pid"]
@@ -155,7 +164,8 @@ def test_agent_that_dies_while_the_connection_is_broken_is_told_afterwards(
 
     boards.wait_for(lambda: "agent-01 has rejoined" in boards.talk, "return of the agent")
 
-    boards.finish()
+    boards.interrupt()
+    assert boards.finish() == 130
     assert boards.document["agents"]["incarnations"] == {"agent-01": 2}
     assert boards.talk.count("agent-01 is lost") == 1
 
@@ -193,8 +203,7 @@ def test_machine_whose_connection_comes_back_too_late_gets_its_agents_again(
 
     boards.wait_for(lambda: "agent-01 has rejoined" in boards.talk, "return of the agent")
 
-    assert boards.process is not None
-    boards.process.send_signal(signal.SIGINT)
+    boards.interrupt()
     assert boards.finish() == 130
     assert "pi01 has returned; its agents agent-01 rejoin" in boards.talk
     assert boards.document["agents"]["incarnations"]["agent-01"] == 2

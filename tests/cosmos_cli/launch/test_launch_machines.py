@@ -295,7 +295,7 @@ def test_frozen_supervisor_is_lost_and_does_not_outlive_the_run(fleet: Fleet) ->
 
 @pytest.mark.parametrize("how", ["link", pytest.param("power", marks=pytest.mark.nightly)])
 def test_machine_that_returns_is_given_its_agents_again(fleet: Fleet, how: str) -> None:
-    fleet.start(**RETURNING, time={"duration_s": 25, "rtf_tolerance": 0.9})
+    fleet.start(**RETURNING, time={"duration_s": 600, "rtf_tolerance": 0.9})
     fleet.wait_until_running()
     if how == "link":
         fleet.break_link("pi01", "silent")
@@ -305,6 +305,9 @@ def test_machine_that_returns_is_given_its_agents_again(fleet: Fleet, how: str) 
     fleet.mend_link("pi01")
     fleet.wait_for("pi01 has returned; its agents agent-01, agent-02 rejoin")
     fleet.wait_for("agent-01 has rejoined")
+    fleet.wait_for("agent-02 has rejoined")
+    stopped = fleet.cosmos("inject", "last", "run", "stop")
+    assert stopped.returncode == 0, stopped.stdout + stopped.stderr
 
     code = fleet.finish()
 
