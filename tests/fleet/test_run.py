@@ -15,6 +15,8 @@ pytestmark = pytest.mark.root
 
 RETURNING = {"on_agent_loss": "continue", "agents": {"count": 6, "tick_hz": 20, "restarts_max": 5}}
 QUICK = {"time": {"duration_s": 3, "rtf_tolerance": 0.9}, "timeouts": PATIENT}
+ENDLESS = {"duration_s": 600, "rtf_tolerance": 0.9}
+"""Of a run that ends by what happens to it, or by a word, however long that takes to come."""
 BOOT_DELAY_S = 1.0
 
 
@@ -56,6 +58,12 @@ def check_whole(tower: RunTower, agents: int) -> None:
     assert len(list((tower.directory / "agents").iterdir())) == agents
     for name in tower.boards:
         assert tower.tower.run(name, "ls cosmos/runs").stdout == ""
+
+
+def stop(tower: RunTower) -> None:
+    """End a run in good order: what had to happen in it has happened."""
+    stopped = tower.cosmos("inject", "last", "run", "stop")
+    assert stopped.returncode == 0, stopped.stdout + stopped.stderr
 
 
 def test_constellation_on_eight_boards_passes_with_nothing_lost(tower: RunTower) -> None:
@@ -101,7 +109,7 @@ def test_host_on_a_board_serves_boards_and_this_computer(tower: RunTower) -> Non
 
 
 def test_detached_run_goes_on_on_boards_and_is_ended_by_its_number(tower: RunTower) -> None:
-    tower.start("--detach", "--host", "pi01")
+    tower.start("--detach", "--host", "pi01", time=ENDLESS, timeouts=PATIENT)
     assert tower.finish() == 0, tower.talk
     number = str(int(tower.directory.name[:4]))
 
@@ -201,7 +209,7 @@ def test_power_cut_ends_the_run_by_name_and_says_what_is_missing(tower: RunTower
     ["crash", *(pytest.param(fault, marks=pytest.mark.nightly) for fault in ("reboot", "down"))],
 )
 def test_board_that_returns_is_given_its_agents_again(tower: RunTower, fault: str) -> None:
-    tower.start(**RETURNING, time={"duration_s": 600, "rtf_tolerance": 0.9})
+    tower.start(**RETURNING, time=ENDLESS)
     tower.wait_until_running()
     tower.tower.fault("pi02", fault)
     tower.wait_until(lambda: "pi02" in tower.talk, "word of pi02")
@@ -211,8 +219,7 @@ def test_board_that_returns_is_given_its_agents_again(tower: RunTower, fault: st
     tower.wait_for("pi02 has returned; its agents agent-03, agent-04 rejoin")
     tower.wait_for("agent-03 has rejoined")
     tower.wait_for("agent-04 has rejoined")
-    stopped = tower.cosmos("inject", "last", "run", "stop")
-    assert stopped.returncode == 0, stopped.stdout + stopped.stderr
+    stop(tower)
 
     code = tower.finish()
 
@@ -288,7 +295,7 @@ def test_board_ends_its_agents_when_the_operator_vanishes_without_a_word(tower: 
 
 
 def test_broken_ssh_sessions_of_one_board_and_of_all_end_no_run(tower: RunTower) -> None:
-    tower.start(time={"duration_s": 30, "rtf_tolerance": 0.9}, timeouts=PATIENT)
+    tower.start(time=ENDLESS, timeouts=PATIENT)
     tower.wait_until_running()
 
     for broken in (("pi02",), tower.boards):
@@ -300,6 +307,7 @@ def test_broken_ssh_sessions_of_one_board_and_of_all_end_no_run(tower: RunTower)
             lambda n=expected: tower.talk.count("goes on over another one") >= n,
             "new connections",
         )
+    stop(tower)
 
     assert tower.finish() == 0, tower.talk
     check_whole(tower, 6)
