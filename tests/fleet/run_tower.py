@@ -29,6 +29,8 @@ SCENARIO: dict[str, Any] = {
     "deadline": {"overrun_ms": 1000, "max_miss_ratio": 1},
     "timeouts": {"shutdown_s": 5},
 }
+ENDLESS = {"duration_s": 600, "rtf_tolerance": 0.9}
+"""Of a run that ends by what happens to it, or by a word, however long that takes to come."""
 PATIENT = {"agents_ready_s": 120, "silence_s": 30, "complete_s": 60, "shutdown_s": 60}
 """Timeouts of a run from which nobody is taken: boards that share this machine's processors wait for them."""
 LIVING = "pgrep -af '[m]adns_runtime|[P]ACKAGE=' || true"
@@ -71,6 +73,11 @@ class RunTower(TalkingProcess):
     def start(self, *arguments: str, **changes: Any) -> None:
         command = ["run", str(self.scenario(**changes)), "-i", str(self.inventory), "--no-report"]
         self.launch([*COSMOS, *command, *arguments], self.environment, start_new_session=True)
+
+    def stop(self) -> None:
+        """End the run in good order: what had to happen in it has happened."""
+        stopped = self.cosmos("inject", "last", "run", "stop")
+        assert stopped.returncode == 0, stopped.stdout + stopped.stderr
 
     def interrupt(self) -> None:
         self.signal(signal.SIGINT)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from run_tower import PATIENT, RunTower
+from run_tower import ENDLESS, PATIENT, RunTower
 from tower import Tower
 from tower.fixtures import need_tower
 
@@ -15,8 +15,6 @@ pytestmark = pytest.mark.root
 
 RETURNING = {"on_agent_loss": "continue", "agents": {"count": 6, "tick_hz": 20, "restarts_max": 5}}
 QUICK = {"time": {"duration_s": 3, "rtf_tolerance": 0.9}, "timeouts": PATIENT}
-ENDLESS = {"duration_s": 600, "rtf_tolerance": 0.9}
-"""Of a run that ends by what happens to it, or by a word, however long that takes to come."""
 BOOT_DELAY_S = 1.0
 
 
@@ -58,12 +56,6 @@ def check_whole(tower: RunTower, agents: int) -> None:
     assert len(list((tower.directory / "agents").iterdir())) == agents
     for name in tower.boards:
         assert tower.tower.run(name, "ls cosmos/runs").stdout == ""
-
-
-def stop(tower: RunTower) -> None:
-    """End a run in good order: what had to happen in it has happened."""
-    stopped = tower.cosmos("inject", "last", "run", "stop")
-    assert stopped.returncode == 0, stopped.stdout + stopped.stderr
 
 
 def test_constellation_on_eight_boards_passes_with_nothing_lost(tower: RunTower) -> None:
@@ -219,7 +211,7 @@ def test_board_that_returns_is_given_its_agents_again(tower: RunTower, fault: st
     tower.wait_for("pi02 has returned; its agents agent-03, agent-04 rejoin")
     tower.wait_for("agent-03 has rejoined")
     tower.wait_for("agent-04 has rejoined")
-    stop(tower)
+    tower.stop()
 
     code = tower.finish()
 
@@ -307,7 +299,7 @@ def test_broken_ssh_sessions_of_one_board_and_of_all_end_no_run(tower: RunTower)
             lambda n=expected: tower.talk.count("goes on over another one") >= n,
             "new connections",
         )
-    stop(tower)
+    tower.stop()
 
     assert tower.finish() == 0, tower.talk
     check_whole(tower, 6)
