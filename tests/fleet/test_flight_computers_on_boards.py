@@ -9,6 +9,7 @@ import pytest
 from harness.emulated_flight import (
     assert_returned,
     assert_untouched,
+    count_commands,
     emulated_flight,
     has_commanded,
 )
@@ -21,7 +22,7 @@ pytestmark = [pytest.mark.root, pytest.mark.nightly, needs_emulator]
 
 LOST, OTHER = "pi02", "pi03"
 AGENT, WITH_COMPUTER, WITHOUT = "agent-02", "agent-03", "agent-01"
-DURATION_S = 40
+DURATION_S = 600
 EMULATORS = "pgrep -a -f '[q]emu-system-arm' || true"
 
 
@@ -56,6 +57,12 @@ def test_lost_board_comes_back_with_its_emulator(tower: RunTower, fault: str) ->
         tower.tower.fault(LOST, "up")
     tower.wait_for(f"{AGENT} has rejoined")
     emulators = tower.tower.run(LOST, EMULATORS).stdout.splitlines()
+    before = count_commands(tower.directory, AGENT)
+    tower.wait_until(
+        lambda: has_commanded(tower.directory, AGENT, before=before),
+        f"command of {AGENT} after its return",
+    )
+    tower.stop()
     code = tower.finish()
 
     assert code == 3, tower.talk

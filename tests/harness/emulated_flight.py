@@ -51,10 +51,15 @@ def records(path: Path) -> list[Any]:
     return [line for line in lines if isinstance(line, list)]
 
 
-def has_commanded(run: Path, agent: str) -> bool:
-    """Tell whether truth holds some commands of an agent's, which its own records then hold, too."""
+def has_commanded(run: Path, agent: str, *, before: int = 0) -> bool:
+    """Tell whether truth holds some commands of an agent's, behind those *before*; its own records then hold them, too."""
+    return count_commands(run, agent) >= before + 3
+
+
+def count_commands(run: Path, agent: str) -> int:
+    """Return how many commands of an agent's truth holds by now."""
     path = run / "host" / "maneuvers.jsonl"
-    return path.exists() and path.read_text().count(f'"{agent}",') >= 3
+    return path.read_text().count(f'"{agent}",') if path.exists() else 0
 
 
 def assert_returned(run: Path, agent: str) -> None:

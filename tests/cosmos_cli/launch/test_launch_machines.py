@@ -20,6 +20,7 @@ import yaml
 from harness.emulated_flight import (
     assert_returned,
     assert_untouched,
+    count_commands,
     emulated_flight,
     has_commanded,
 )
@@ -107,6 +108,11 @@ class Fleet(TalkingProcess):
             timeout=PATIENCE_S,
             check=False,
         )
+
+    def stop_run(self) -> None:
+        """End the run in good order: what had to happen in it has happened."""
+        stopped = self.cosmos("inject", "last", "run", "stop")
+        assert stopped.returncode == 0, stopped.stdout + stopped.stderr
 
     # Faults -----------------------------------------------------------------------------------------
 
@@ -306,8 +312,7 @@ def test_machine_that_returns_is_given_its_agents_again(fleet: Fleet, how: str) 
     fleet.wait_for("pi01 has returned; its agents agent-01, agent-02 rejoin")
     fleet.wait_for("agent-01 has rejoined")
     fleet.wait_for("agent-02 has rejoined")
-    stopped = fleet.cosmos("inject", "last", "run", "stop")
-    assert stopped.returncode == 0, stopped.stdout + stopped.stderr
+    fleet.stop_run()
 
     code = fleet.finish()
 
@@ -328,7 +333,7 @@ def test_machine_that_returns_is_given_its_agents_again(fleet: Fleet, how: str) 
 
 @needs_emulator
 def test_flight_computer_of_a_board_that_was_lost_is_started_anew_with_it(fleet: Fleet) -> None:
-    changes = emulated_flight(fleet.folder, "agent-01", "agent-03", count=4, duration_s=20)
+    changes = emulated_flight(fleet.folder, "agent-01", "agent-03", count=4, duration_s=600)
     fleet.start(**changes, **LOSING)
     fleet.wait_until_running()
     fleet.wait_until(lambda: has_commanded(fleet.directory, "agent-01"), "command of agent-01")
@@ -337,6 +342,13 @@ def test_flight_computer_of_a_board_that_was_lost_is_started_anew_with_it(fleet:
     assert [each for each in find_marked(*fleet.on("pi01")) if "qemu" in each.command] == []
     fleet.mend_link("pi01")
     fleet.wait_for("agent-01 has rejoined")
+    fleet.wait_for("agent-02 has rejoined")
+    before = count_commands(fleet.directory, "agent-01")
+    fleet.wait_until(
+        lambda: has_commanded(fleet.directory, "agent-01", before=before),
+        "command of agent-01 after its return",
+    )
+    fleet.stop_run()
 
     code = fleet.finish()
 
