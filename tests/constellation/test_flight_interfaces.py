@@ -15,13 +15,15 @@ from pathlib import Path
 
 import guided_program
 import pytest
-from test_flight_process import HZ, Ship, patience  # noqa: F401 - a fixture
+from test_flight_process import HZ, PATIENCE_S, Ship, patience  # noqa: F401 - a fixture
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.plugin import isolation
 from madns_runtime.plugin.device_view import ChannelFrame
 from madns_runtime.simulations.constellation.flight.asked_ticks import UNANSWERED_MAX
+from madns_runtime.simulations.constellation.flight.interface.program import FlightProgram
 from madns_runtime.simulations.constellation.flight.interface.socket_transports import resolve_both
+from madns_runtime.simulations.constellation.flight.process import ExternalFlight
 
 pytestmark = pytest.mark.process
 
@@ -458,7 +460,8 @@ def test_one_that_prints_between_its_frames_is_told_what_came(tmp_path, is_locks
     ship.agent.finish()
 
 
-def test_one_that_floods_costs_no_tick_and_is_counted(tmp_path):
+def test_one_that_floods_costs_no_tick_and_is_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(FlightProgram, "patience_s", 0.3)  # it never ends by itself
     flight = attached({"kind": "stdio"})
     flight["command"] = [
         sys.executable,
@@ -597,7 +600,10 @@ def test_what_a_protocol_of_ones_own_does_wrong_is_told_by_its_name(
         Ship(tmp_path, None, flight=flight).run(3)
 
 
-def test_what_a_protocol_of_ones_own_does_wrong_with_the_last_answers_is_told(tmp_path):
+def test_what_a_protocol_of_ones_own_does_wrong_with_the_last_answers_is_told(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(ExternalFlight, "last_answers_s", PATIENCE_S)
     body = "if self.is_odd: raise ValueError('odd')\n        return Own.feed(self, given)"
     text = OWN.replace("METHOD", "feed").replace("BODY", body)
     (tmp_path / "own.py").write_text(text.replace("faults = 3", "is_odd = False"))

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from harness.cosmos_command import LOOSE, CosmosCommand
-from test_flight_process import Ship
+from test_flight_process import Ship, patience  # noqa: F401 - a fixture
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.simulations.constellation.flight.interface import program
