@@ -15,6 +15,7 @@ from pathlib import Path
 
 import guided_program
 import pytest
+from harness.waiting import wait_until
 from test_flight_process import HZ, PATIENCE_S, Ship, patience  # noqa: F401 - a fixture
 
 from madns_runtime.errors import BlamedError
@@ -447,15 +448,17 @@ def test_one_that_hangs_in_lockstep_is_named_and_killed(tmp_path):
 
 @pytest.mark.parametrize("is_lockstep", [True, False])
 def test_one_that_prints_between_its_frames_is_told_what_came(tmp_path, is_lockstep):
-    flight = attached({"kind": "stdio"}) | {"answer_s": 3.0 if is_lockstep else 20.0}
-    # A shell has begun long before the wait is over, also on a busy machine.
+    flight = attached({"kind": "stdio"})
     flight["command"] = ["sh", "-c", r"printf 'debug\000\n'; cat > /dev/null"]
     ship = Ship(tmp_path, None, flight=flight, is_lockstep=is_lockstep)
     told = r"; it said what was no good packet: corrupt \d+"
+    software = ship.agent._cockpit._software
     if is_lockstep:
         with pytest.raises(BlamedError, match=told):
-            ship.run(1)
+            ship.give_up_once(lambda: software._protocol.faults["corrupt"]).run(1)
         return
+    ship.run(1)
+    wait_until(lambda: software._link._thread._found)  # it is told once, with what came by then
     ship.run_until(lambda: any(re.search(told, text) for _, text in ship.context.logs))
     ship.agent.finish()
 
