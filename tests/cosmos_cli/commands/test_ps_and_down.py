@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -18,7 +18,9 @@ from harness.waiting import is_alive, wait_until
 from cosmos_cli.app import run as cosmos
 from cosmos_cli.commands.ps import age_words
 from cosmos_cli.launch.living_processes import LivingRun, is_called, living_runs
+from cosmos_cli.onboard import processes
 from cosmos_cli.onboard.processes import HOST_LEAD_S, end_entries
+from madns_runtime.processes import ProcessEntry
 
 pytestmark = pytest.mark.process
 
@@ -199,14 +201,21 @@ def test_down_gives_the_parts_of_a_hanging_operator_the_time_for_a_clean_shutdow
     assert waits[:3] == [(["host", "operator"], 30.0), (["host"], HOST_LEAD_S), (["host"], 30.0)]
 
 
-def test_down_ends_workers_that_are_not_in_the_register(start: Start) -> None:
+def test_down_ends_workers_that_are_not_in_the_register(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
     host = start("0001-a", "host", "host", "with-worker")
     worker_pid = host.worker_pid  # type: ignore[attr-defined]
     (run,) = living_runs()
+    wait = processes._wait
 
-    # Its worker lets all of it pass: enough for the host to end on a busy machine.
+    def wait_for_others(entries: Sequence[ProcessEntry], timeout_s: float) -> None:
+        """Wait for the worker, who heeds nothing else, only when it is killed; for the host as long as it needs."""
+        wait([entry for entry in entries if entry.pid != worker_pid] or entries, PATIENCE_S)
+
+    monkeypatch.setattr(processes, "_wait", wait_for_others)
     ending = end_entries(
-        run.processes, directory=run.directory, clean_s=4.0, forced_s=PATIENCE_S, say=lambda _: None
+        run.processes, directory=run.directory, clean_s=4.0, forced_s=4.0, say=lambda _: None
     )
 
     assert [entry.pid for entry in ending.killed] == [worker_pid]
