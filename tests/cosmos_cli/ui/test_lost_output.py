@@ -13,11 +13,14 @@ from cosmos_cli import app
 from cosmos_cli.commands import inject
 
 COSMOS = f"{sys.executable} -m cosmos_cli.app"
+TO_NOBODY = ">&3"
+"""Into a pipe whose reader has gone before the command begins."""
 
 
 def shell(command: str) -> subprocess.CompletedProcess[str]:
+    begin = "exec 3> >(true); wait $!; "
     return subprocess.run(
-        ["bash", "-c", command], capture_output=True, text=True, timeout=120, check=False
+        ["bash", "-c", begin + command], capture_output=True, text=True, timeout=120, check=False
     )
 
 
@@ -50,7 +53,7 @@ def test_verdicts_exit_code_survives_an_output_that_takes_nothing(
 
 @pytest.mark.process
 def test_verdicts_exit_code_survives_a_reader_that_has_gone(run_path: Path) -> None:
-    ended = shell(f"{COSMOS} collect {run_path} -q --json | true; exit ${{PIPESTATUS[0]}}")
+    ended = shell(f"{COSMOS} collect {run_path} -q --json {TO_NOBODY}")
 
     assert ended.returncode == 5
     assert "defect" not in ended.stderr
@@ -61,7 +64,7 @@ TINY = "name: tiny\nsimulation: counter\nagents: {count: 1, tick_hz: 5}\ntime: {
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("redirection", ["| true", "2>&1 | true", ">&-"])
+@pytest.mark.parametrize("redirection", [TO_NOBODY, f"{TO_NOBODY} 2>&1", ">&-"])
 def test_tests_go_on_without_an_output_and_tell_by_their_file_and_code(
     tmp_path: Path, redirection: str
 ) -> None:
@@ -70,8 +73,7 @@ def test_tests_go_on_without_an_output_and_tell_by_their_file_and_code(
     junit = tmp_path / "results.xml"
 
     ended = shell(
-        f"{COSMOS} test {tmp_path} -j 1 --runs {tmp_path / 'runs'} --junit {junit} {redirection};"
-        " exit ${PIPESTATUS[0]}"
+        f"{COSMOS} test {tmp_path} -j 1 --runs {tmp_path / 'runs'} --junit {junit} {redirection}"
     )
 
     assert ended.returncode == 1
@@ -91,9 +93,7 @@ def test_code_of_judge_survives_a_reader_that_has_gone(
     )
     shell(f"{COSMOS} run {tmp_path / 'a.yaml'} --runs {tmp_path / 'runs'} -q")
 
-    ended = shell(
-        f"{COSMOS} judge -s {tmp_path / 'b.yaml'} --runs {tmp_path / 'runs'} | true; exit ${{PIPESTATUS[0]}}"
-    )
+    ended = shell(f"{COSMOS} judge -s {tmp_path / 'b.yaml'} --runs {tmp_path / 'runs'} {TO_NOBODY}")
 
     assert ended.returncode == code
 
@@ -112,7 +112,7 @@ def test_code_of_what_was_done_survives_a_full_output(tmp_path: Path, command: s
 
 
 @pytest.mark.process
-@pytest.mark.parametrize(("redirection", "code"), [(">/dev/full", 1), ("| true", 0)])
+@pytest.mark.parametrize(("redirection", "code"), [(">/dev/full", 1), (TO_NOBODY, 0)])
 def test_what_machines_said_is_nowhere_else_and_fails_on_a_full_disk_alone(
     tmp_path: Path, redirection: str, code: int
 ) -> None:
@@ -120,8 +120,7 @@ def test_what_machines_said_is_nowhere_else_and_fails_on_a_full_disk_alone(
     inventory.write_text("all: {hosts: {here: {ansible_connection: local}}}\n")
 
     ended = shell(
-        f"{COSMOS} exec -i {inventory} --json -- 'echo said; touch {tmp_path}/done' {redirection};"
-        " exit ${PIPESTATUS[0]}"
+        f"{COSMOS} exec -i {inventory} --json -- 'echo said; touch {tmp_path}/done' {redirection}"
     )
 
     assert ended.returncode == code, ended.stderr
@@ -142,7 +141,7 @@ def test_code_of_inject_survives_a_full_output(
 
 @pytest.mark.process
 def test_collecting_goes_on_when_nobody_hears_its_talk(run_path: Path) -> None:
-    ended = shell(f"{COSMOS} collect {run_path} 2>&1 | true; exit ${{PIPESTATUS[0]}}")
+    ended = shell(f"{COSMOS} collect {run_path} {TO_NOBODY} 2>&1")
 
     assert ended.returncode == 5
     assert (run_path / "run.json").exists()
@@ -160,7 +159,7 @@ def test_other_commands_end_with_1_and_one_line(redirection: str) -> None:
 
 @pytest.mark.process
 def test_a_reader_that_has_gone_is_told_as_by_a_shell_and_not_as_a_failure() -> None:
-    ended = shell(f"{COSMOS} schema | true; exit ${{PIPESTATUS[0]}}")
+    ended = shell(f"{COSMOS} schema {TO_NOBODY}")
 
     assert (ended.returncode, ended.stderr) == (141, "")
 
