@@ -251,6 +251,7 @@ def test_numbers_of_any_size_are_drawn_without_a_word_of_our_source():
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.simplefilter("ignore", ResourceWarning)  # of what other tests left unclosed
         page = render_page({"run": "r"}, [Section(title="s", blocks=drawn)])
 
     assert "The figure speed" not in page
