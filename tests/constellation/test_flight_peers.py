@@ -164,7 +164,7 @@ class Peers:
                 process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
                 self.processes.append(process)
             elif (
-                self.seen.get("well", 0.0) >= 2.0
+                self.seen.get("well", 0.0) >= 0.5
                 and "killed" not in self.seen
                 and is_connected(process.pid)
             ):
