@@ -41,10 +41,11 @@ SCENARIO: dict[str, Any] = {
     "agents": {"count": 3, "tick_hz": 20},
     "time": {"duration_s": 2, "rtf_tolerance": 0.9},
     "deadline": {"overrun_ms": 1000, "max_miss_ratio": 1},
-    "timeouts": {"start_lead_s": 0.3, "shutdown_s": 5, "silence_s": 30},
+    "timeouts": {"start_lead_s": 0.3, "shutdown_s": 60, "silence_s": 30},
     "recording": {"flush_interval_s": 0.1},
     "executor": {"kind": "thread"},
 }
+"""Its records come to a busy machine's disk, too: where somebody hangs at the end, a test gives less time for that."""
 
 
 class Laboratory:

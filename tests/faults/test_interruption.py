@@ -25,13 +25,11 @@ from madns_runtime.recording.reader import read_stream
 pytestmark = pytest.mark.process
 
 LONG = ("--set", "time.duration_s=600")
-CLEAN = ("--set", "timeouts.shutdown_s=60")
-"""Records come to a busy machine's disk, too."""
 STUCK = {"side": "agent", "method": "step", "action": "sleep", "sleep_s": 300.0}
 
 
 def started(laboratory: Laboratory, *arguments: str) -> Run:
-    run = laboratory.start(*LONG, *CLEAN, *arguments, new_group=True)
+    run = laboratory.start(*LONG, *arguments, new_group=True)
     run.wait_until_running()
     return run
 
@@ -173,7 +171,7 @@ def test_hand_started_agent_that_is_killed_is_lost(laboratory):
 
 
 def test_ctrl_c_on_a_terminal_of_its_own_ends_an_agent_started_by_hand(laboratory):
-    run = laboratory.start(*LONG, *CLEAN, "--manual", "agent-02")
+    run = laboratory.start(*LONG, "--manual", "agent-02")
     with start_by_hand(run) as by_hand:
         run.wait_until_running()
         os.killpg(by_hand.pid, signal.SIGINT)

@@ -25,8 +25,6 @@ pytestmark = pytest.mark.process
 
 HZ = SCENARIO["agents"]["tick_hz"]
 LONG = ("--set", "time.duration_s=600")
-CLEAN = ("--set", "timeouts.shutdown_s=60")
-"""Records come to a busy machine's disk, too."""
 LATER_S = 6
 LATER = ("--set", f"time.duration_s={LATER_S}")
 """There is time to be killed and to be started anew, on a busy machine as well."""
@@ -172,7 +170,7 @@ def test_agents_of_a_killed_host_end_by_themselves_with_their_records_closed(lab
 
 
 def test_nothing_survives_a_killed_operator_and_its_run_can_be_collected(laboratory):
-    run = laboratory.start(*LONG, *CLEAN)
+    run = laboratory.start(*LONG)
     run.wait_until_running()
     assert len(laboratory.living()) >= 6  # operator, host, supervisor, three agents
     run.process.kill()
@@ -224,7 +222,8 @@ def test_nothing_survives_an_operator_that_is_killed_before_the_run(laboratory, 
 def test_plugin_that_is_still_being_imported_does_not_survive_a_killed_operator(laboratory):
     hang_on_import(laboratory)
     run = laboratory.start(
-        "--set", "timeouts.agents_ready_s=600", "--set", "timeouts.loading_s=600"
+        *("--set", "timeouts.agents_ready_s=600", "--set", "timeouts.loading_s=600"),
+        *("--set", "timeouts.shutdown_s=5"),
     )
     run.pid_of("loopback")
     run.process.kill()
