@@ -166,6 +166,18 @@ class Run(TalkingProcess):
 
         return int(self.wait_until(find, f"process of {name}"))
 
+    def wait_until_ticking(self, stream: Path) -> None:
+        """Wait until a stream of ticks, which may not have begun, holds one."""
+        # The first line tells what the others hold.
+        self.wait_until(
+            lambda: stream.exists() and stream.read_bytes().count(b"\n") > 1, f"tick in {stream}"
+        )
+
+    def complete(self) -> None:
+        """Have it complete, by the word of a timeline, as soon as simulated time runs."""
+        order = ("inject", "last", "run", "stop")
+        self.wait_until(lambda: self.laboratory.cosmos(*order).returncode == 0, "stop of the run")
+
     # What it leaves -------------------------------------------------------------------------------
 
     @property

@@ -25,10 +25,7 @@ pytestmark = pytest.mark.process
 
 HZ = SCENARIO["agents"]["tick_hz"]
 LONG = ("--set", "time.duration_s=600")
-LATER_S = 6
-LATER = ("--set", f"time.duration_s={LATER_S}")
-"""There is time to be killed and to be started anew, on a busy machine as well."""
-CONTINUE = ("--set", "on_agent_loss=continue", *LATER)
+CONTINUE = ("--set", "on_agent_loss=continue", *LONG)
 RESTART = (*CONTINUE, "--set", "agents.restarts_max=1")
 
 
@@ -72,7 +69,7 @@ def last_tick(path: Path) -> int:
 
 @WHEN
 def test_killed_agent_aborts_the_run_and_is_named(laboratory, start_and_kill):
-    run = start_and_kill(laboratory, *LATER)
+    run = start_and_kill(laboratory, *LONG)
 
     document = check_ending(run, 1, "failed", "FAILED: agent-02: killed by SIGKILL")
     assert document["who"] == "agent-02"
@@ -91,6 +88,8 @@ def test_others_complete_without_the_killed_agent_if_the_policy_is_to_continue(
     laboratory, start_and_kill
 ):
     run = start_and_kill(laboratory, *CONTINUE)
+    run.wait_for("agent-02 is lost: killed by SIGKILL")
+    run.complete()
 
     document = check_ending(
         run, 5, "complete", "agent-02 is lost: killed by SIGKILL", "DATA INCOMPLETE: agent-02: "
@@ -105,29 +104,32 @@ def test_others_complete_without_the_killed_agent_if_the_policy_is_to_continue(
         "agent-02": "lost",
         "agent-03": "stopped",
     }
-    assert result["agents"]["agent-01"]["ticks"]["due"] == LATER_S * HZ
+    assert result["agents"]["agent-01"]["ticks"]["due"] == round(document["duration_s"] * HZ)
 
 
 @WHEN
 def test_killed_agent_is_started_again_and_rejoins_at_the_present_time(laboratory, start_and_kill):
     run = start_and_kill(laboratory, *RESTART)
+    run.wait_for("agent-02 has rejoined at t = ")
+    agents = run.directory / "agents"
+    if start_and_kill is kill_in_run:
+        run.wait_until_ticking(agents / "agent-02/ticks.2.jsonl")
+    run.complete()
 
     # What the first life had begun to write is cut, and said to be; if it had not begun, 4 is right.
     code = 4 if start_and_kill is kill_before_hello and run.finish() == 4 else 5
     document = check_ending(run, code, "complete", "agent-02 is lost: killed by SIGKILL")
-    agents = run.directory / "agents"
     result = run.result
     assert result["agents"]["agent-02"]["state"] == "stopped"
     assert all(line.startswith("agent-02: ") for line in document["data"]["missing"])
     if start_and_kill is not kill_in_run:
         return
     assert document["agents"]["incarnations"] == {"agent-02": 2}
-    assert "agent-02 has rejoined at t = " in run.talk
     # The second life's streams are beside the first's, and begin where simulated time had come to.
     ended = last_tick(agents / "agent-02/ticks.jsonl")
     assert first_tick(agents / "agent-02/ticks.2.jsonl") > ended
     assert first_tick(agents / "agent-02/waves.2.jsonl") > ended
-    assert result["agents"]["agent-01"]["ticks"]["due"] == LATER_S * HZ
+    assert result["agents"]["agent-01"]["ticks"]["due"] == round(document["duration_s"] * HZ)
 
 
 def test_last_agent_killed_ends_the_run_whatever_the_policy(laboratory):
