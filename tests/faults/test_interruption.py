@@ -92,7 +92,7 @@ def test_second_ctrl_c_ends_at_once_what_hangs(laboratory):
 
 def test_one_ctrl_c_suffices_when_an_agent_hangs(laboratory):
     # Long enough for the others to close their records on a busy machine.
-    run = laboratory.start(*LONG, "--set", "timeouts.shutdown_s=5", faults=STUCK, new_group=True)
+    run = laboratory.start(*LONG, "--set", "timeouts.shutdown_s=10", faults=STUCK, new_group=True)
     run.wait_until_struck()
     press_ctrl_c(run)
 
@@ -127,7 +127,7 @@ def test_ps_lists_a_run_and_down_ends_it_cleanly(laboratory):
 def test_down_ends_a_run_whose_operator_hangs(laboratory):
     run = started(laboratory)
     run.signal(signal.SIGSTOP)
-    ended = laboratory.cosmos("down", "--all", "--timeout", "1")
+    ended = laboratory.cosmos("down", "--all", "--timeout", "10")
 
     assert ended.returncode == 0, ended.stderr
     assert "1 of them by force" in ended.stdout
