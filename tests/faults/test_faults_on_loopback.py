@@ -90,11 +90,12 @@ def test_processes_that_are_killed_on_purpose_return_and_cost_no_verdict(laborat
 
 def test_an_end_on_purpose_takes_no_return_from_an_agent_that_fails_later(laboratory):
     (laboratory.folder / "acting.py").write_text(ACTING)
+    back = {"stream": "events", "agents": ["host"], "field": "event", "equals": "agent_rejoined"}
     result, _ = run_faults(
         laboratory,
         [
             {"at_s": 1, "action": "restart", "agents": ["agent-01"]},
-            {"at_s": 5, "action": "act", "agents": ["agent-01"]},
+            {"when": back, "action": "act", "agents": ["agent-01"]},
         ],
         duration_s=10,
         simulation="./acting.py:simulation",
@@ -154,6 +155,7 @@ def test_of_a_process_that_others_share_only_the_half_is_dropped_and_it_returns_
             {"at_s": 6, "action": "restart", "agents": ["agent-03"]},
         ],
         per_process=2,
+        duration_s=14,
     )
 
     assert (result["exit_code"], result["status"]) == (0, "complete"), result["verdict"]
