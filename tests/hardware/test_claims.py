@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from harness.cosmos_command import CosmosCommand
+from harness.cosmos_command import LOOSE, CosmosCommand
 from harness.waiting import wait_until
 
 from madns_runtime.config import DeviceLaunch
@@ -91,7 +91,7 @@ import time
 from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Sample
 
 class Gauge(Device):
-    kind = DeviceKind(name="gauge", summary="a gauge", channels=(Channel(name="level"),), rate_hz=20.0)
+    kind = DeviceKind(name="gauge", summary="a gauge", channels=(Channel(name="level"),), rate_hz=2.0)
     def read(self):
         return Sample(values={"level": 1.0}, taken_s=time.monotonic())
 """
@@ -112,7 +112,7 @@ def test_a_second_run_and_a_test_of_a_device_in_use_are_refused_by_name(tmp_path
         "hardware: {use: [{devices: [gauge]}], on_device_loss: continue}\n"
     )
     cosmos = CosmosCommand(tmp_path)
-    first = cosmos.start_run(scenario, options=("--no-report", "-i", inventory))
+    first = cosmos.start_run(scenario, *LOOSE, options=("--no-report", "-i", inventory))
     try:
         samples = tmp_path / "runs/0001-use/devices/here/gauge/level.jsonl"
         wait_until(lambda: samples.exists(), patience_s=PATIENCE_S)
