@@ -25,7 +25,7 @@ def test_runs_in_a_row_leave_nothing_but_their_evidence(laboratory: Laboratory, 
     scenario = laboratory.folder / "brief.yaml"
     brief = {**SCENARIO, "agents": {"count": 2, "tick_hz": 20}}
     brief["time"] = {**SCENARIO["time"], "duration_s": 0.2}
-    brief["timeouts"] = {"start_lead_s": 0.05}
+    brief["timeouts"] = {**SCENARIO["timeouts"], "start_lead_s": 0.05}
     scenario.write_text(yaml.safe_dump(brief))
     done = subprocess.run(
         [sys.executable, str(DRIVER), str(times), str(scenario), "--no-report", "--quiet"],
