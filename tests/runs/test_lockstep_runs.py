@@ -90,9 +90,9 @@ def test_a_run_that_is_collected_again_says_the_same(cosmos):
     assert "complete" in json.dumps(listed)
 
 
-def running(cosmos, *options):
+def running(cosmos):
     """Start a run that would take an hour, and wait until it runs."""
-    endless = ("--set", "time.duration_s=300000", "--no-report", *options)
+    endless = ("--set", "time.duration_s=300000", "--set", "timeouts.shutdown_s=60", "--no-report")
     process = cosmos.start("run", SCENARIOS / "counter24.yaml", *LOCKSTEP, *endless)
     for line in process.stderr:
         if line.strip() == "running":
@@ -108,7 +108,7 @@ def wait_until_nobody_is_left(cosmos, monkeypatch):
 def test_ctrl_c_ends_it_in_good_order(cosmos, monkeypatch):
     process = running(cosmos)
     process.send_signal(signal.SIGINT)
-    out, _ = process.communicate(timeout=60)
+    out, _ = process.communicate(timeout=120)
 
     assert process.returncode == 130
     assert out.startswith("INTERRUPTED by operator")
