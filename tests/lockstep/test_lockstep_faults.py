@@ -136,7 +136,7 @@ def test_a_worker_that_dies_is_noticed_at_once_and_named(start_host, fault, expe
 
 def slow_host(start_host):
     """Return a run that stands at t = 0.2 s with all its workers, and who they are."""
-    run = start_host(fault="job_hang", timeouts=Timeouts(shutdown_s=5.0))
+    run = start_host(fault="job_hang", timeouts=Timeouts(shutdown_s=60.0))
     wait_until(lambda: any(e.get("state") == "SIMULATION_START" for e in run.events), "no start")
     return run, workers_of(run)
 
