@@ -36,8 +36,8 @@ def test_ten_iridium_satellites_lose_nothing_and_record_little(tmp_path):
     assert all(a["segments"] >= 2 for a in agents.values())
     assert result["simulation"]["host"]["energy_drift_max"] < 1e-12
     recorded = sum(p.stat().st_size for p in evidence.glob("agents/*/*.jsonl"))
-    ticks = sum(len(records(p)) for p in evidence.glob("agents/*/ticks.jsonl"))
-    assert recorded / ticks <= 160
+    # Of those that were due: one that a busy machine has missed is on record, too.
+    assert recorded / result["timing"]["ticks"] <= 160
 
 
 def test_recorded_states_follow_the_recorded_energy(tmp_path):
