@@ -73,7 +73,9 @@ def test_a_count_that_ends_a_run_goes_on_when_its_agent_is_started_anew(run):
 
 
 def test_a_run_in_real_time_ends_as_soon_as_the_host_has_heard(run):
-    code, document = run("realtime", STOPS, settings=(*LOOSE, "time.duration_s=60"))
+    # Of one agent: what ends the run may come before others, which a busy machine keeps waiting, have recorded anything.
+    stops = STOPS.replace("stream:", "agents: [agent-01], stream:")
+    code, document = run("realtime", stops, settings=(*LOOSE, "time.duration_s=60"))
 
     check = of_name(document, "few")
     assert (code, document["status"], check["passed"]) == (4, "broken", False)
