@@ -57,7 +57,7 @@ def test_recorded_states_follow_the_recorded_energy(tmp_path):
 def test_agents_of_one_process_record_more_files_than_it_may_have_open_at_first(tmp_path):
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     few = 160  # 1024 on most computers, and some hundred agents
-    together = ("agents.count=40", "agents.per_process=40", "agents.tick_hz=2", "time.duration_s=1")
+    together = ("agents.count=40", "agents.per_process=40", "agents.tick_hz=2", "time.duration_s=4")
     settings = [word for each in (*LOOSE, *together) for word in ("--set", each)]
     cosmos = CosmosCommand(tmp_path)
 

@@ -220,7 +220,7 @@ def test_what_waits_for_a_condition_that_is_met_in_set_up_takes_place_at_time_ze
 ):
     started = {"stream": "events", "field": "event", "equals": "start"}
     entry = {"when": started, "action": "annotate", "text": "started"}
-    path = written(tmp_path, [entry], mode=mode, duration_s=0.5)
+    path = written(tmp_path, [entry], mode=mode, duration_s=4)
 
     code, result = cosmos.run(path, *LOOSE)
 
