@@ -198,7 +198,7 @@ class ConditionMet:
 
 @dataclass(frozen=True, slots=True)
 class ActionOrder:
-    """Host -> agent, RELIABLE: carry out an action of the timeline, or let what it did be over."""
+    """Host -> agent, SYNC as AgentFault: carry out an action of the timeline, or let what it did be over."""
 
     KIND: ClassVar[int] = 19
     number: int
@@ -216,7 +216,7 @@ class ActionOrder:
 
 @dataclass(frozen=True, slots=True)
 class AgentFault:
-    """Host -> agent: a fault of you or of your steps begins or ends; see `timeline.fault_kinds`."""
+    """Host -> agent, SYNC: a fault of you or of your steps begins or ends; see `timeline.fault_kinds`."""
 
     KIND: ClassVar[int] = 18
     number: int

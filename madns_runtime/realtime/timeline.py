@@ -153,6 +153,7 @@ class HostTimeline:
             return False
         try:
             self._port.must_pump = True
-            return self._port.session.send(agent, order, Service.RELIABLE, self._port.monotonic_s())
+            # In the stream of faults: what was ordered before its agent was killed comes before that.
+            return self._port.session.send(agent, order, Service.SYNC, self._port.monotonic_s())
         except MadnsError:  # it takes nothing
             return False

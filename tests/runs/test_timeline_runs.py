@@ -126,12 +126,13 @@ def test_a_clock_that_is_stepped_is_found_again_and_recorded(cosmos, tmp_path):
     assert offsets_us[-1] - offsets_us[0] == pytest.approx(-150_000 - 300, abs=20_000)
 
 
+@pytest.mark.parametrize("killed_s", [0.5, 1.5], ids=["at once", "later"])
 def test_a_clock_that_drifts_for_an_agent_that_is_lost_is_right_for_those_that_share_it(
-    cosmos, tmp_path
+    cosmos, tmp_path, killed_s
 ):
     entries = [
         {"at_s": 0.5, "action": "drift_clock", "agents": ["agent-01"], "ppm": 300},
-        {"at_s": 1.5, "action": "kill", "agents": ["agent-01"]},
+        {"at_s": killed_s, "action": "kill", "agents": ["agent-01"]},
     ]
     path = written(tmp_path, entries, mode="realtime", duration_s=3)
 
