@@ -110,6 +110,16 @@ def test_entry_of_an_earlier_boot_is_removed(register_directory):
     assert not path.exists()
 
 
+def test_no_entry_is_removed_by_a_process_that_cannot_see_who_lives(
+    register_directory, monkeypatch
+):
+    entry, path = enter(register_directory)
+    monkeypatch.setattr(processes, "read_start_ticks", lambda pid: None)
+
+    assert list_processes() == [entry]
+    assert path.exists()
+
+
 @pytest.mark.process
 def test_entry_whose_pid_was_given_out_again_is_removed_and_not_signalled(
     register_directory, child
