@@ -39,6 +39,9 @@ from madns_runtime.reactor.reactor import Reactor
 
 LOOK_PERIOD_S: Final = 0.05
 """Between two looks at the devices' pages."""
+STALL_S: Final = 1.0
+STALL_GRACE_S: Final = 0.5
+"""Who looks so late stood still itself, and so may have the devices: they are given a grace, once."""
 OPENING_S: Final = 5.0
 """How long agents wait for devices to be opened, once, before they are started themselves."""
 OPENING_POLL_S: Final = 0.005
@@ -94,6 +97,7 @@ class DeviceManager:
         self._reactor: Reactor | None = None
         self._emit: Emit = lambda event: None
         self._is_ending = False
+        self._looked_s = float("inf")
 
     def start(self) -> None:
         """Start the guardian and the devices' processes, and wait, bounded, until each device was opened or has failed."""
@@ -321,13 +325,16 @@ class DeviceManager:
     # Statuses -----------------------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Note every device's status, tell what has changed, and give up who hangs."""
+        """Note every device's status, tell what has changed, and give up who hangs; not right after a stall."""
         now_s = monotonic()
-        for process in self._processes:
+        stood_still = now_s - self._looked_s > STALL_S
+        self._looked_s = float("inf") if stood_still else now_s
+        for process in () if stood_still else self._processes:
             for driven in process.devices:
                 self._look_at(process, driven, now_s)
         if self._reactor is not None and not self._is_ending:
-            self._reactor.call_at(now_s + LOOK_PERIOD_S, self._look)
+            pause_s = STALL_GRACE_S if stood_still else LOOK_PERIOD_S
+            self._reactor.call_at(now_s + pause_s, self._look)
 
     def _look_at(self, process: DeviceProcess, driven: DrivenDevice, now_s: float) -> None:
         status = driven.seat.page.status(driven.limits, now_s)
@@ -341,14 +348,8 @@ class DeviceManager:
             if status == "lost":
                 driven.loss = driven.why or driven.why_silent()
                 driven.seat.page.loss.write(driven.loss)
-            self._emit(
-                {
-                    "event": "device",
-                    "device": driven.name,
-                    "status": status,
-                    "why": driven.loss if status == "lost" else "",
-                }
-            )
+            why = driven.loss if status == "lost" else ""
+            self._emit({"event": "device", "device": driven.name, "status": status, "why": why})
         # Behind its reason: who reads the count finds that.
         if driven.account.counted_s is not None:
             driven.seat.page.header[page.LOSSES] = driven.account.times_lost
@@ -392,9 +393,8 @@ class DeviceManager:
             wait_for(process.pid, monotonic() + KILL_WAIT_S)
             for driven in process.devices:
                 driven.blame(f"its driver did not return within {END_S:g} s of the run's end")
-                self._emit(
-                    {"event": "log", "level": "error", "text": f"{driven.name}: {driven.why}"}
-                )
+                text = f"{driven.name}: {driven.why}"
+                self._emit({"event": "log", "level": "error", "text": text})
         process.pid = 0
         self._hear(process)
         self._hang_up(process)

@@ -320,6 +320,31 @@ def test_counts_survive_the_process_that_counted(tmp_path):
     assert report["unreported"] == 1  # its records have no end
 
 
+def stand_still(bench):
+    """Hold the device and its manager's loop up for longer than a device may be silent."""
+    os.kill(bench.pid_of(), signal.SIGSTOP)
+    time.sleep(1.5)
+
+
+def test_a_device_that_stood_still_with_its_manager_is_not_lost(tmp_path, monkeypatch):
+    monkeypatch.setattr(manager, "STALL_GRACE_S", 60.0)
+    with line_bench(tmp_path, lost_s=1.0) as (bench, _):
+        bench.until(lambda: bench.statuses("line")[-1:] == ["ok"])
+        told, number = bench.statuses("line"), bench.hardware["line"]["time"].number
+        stand_still(bench)
+        os.kill(bench.pid_of(), signal.SIGCONT)
+        bench.until(lambda: bench.hardware["line"]["time"].number > number + 1)
+
+        assert bench.statuses("line") == told
+
+
+def test_a_device_that_still_says_nothing_after_the_grace_is_lost(tmp_path):
+    with line_bench(tmp_path, lost_s=1.0) as (bench, _):
+        bench.until(lambda: bench.statuses("line")[-1:] == ["ok"])
+        stand_still(bench)
+        bench.until(lambda: bench.statuses("line")[-1] == "lost")
+
+
 def test_a_process_whose_words_were_heard_by_another_look_is_not_taken_for_gone(tmp_path):
     with line_bench(tmp_path) as (bench, _):
         bench.until(lambda: bench.statuses("line") == ["ok"])
