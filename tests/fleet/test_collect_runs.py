@@ -7,6 +7,7 @@ import time
 
 import pytest
 from harness.cosmos_command import CosmosCommand
+from harness.waiting import wait_until
 from tower import Tower
 from tower.fixtures import need_tower
 
@@ -50,8 +51,9 @@ class Operator:
 
     def stop(self, process):
         """End a run in good order, and return what it has said: what had to happen in it has happened."""
-        stopped = self.cosmos("inject", "last", "run", "stop")
-        assert stopped.returncode == 0, stopped.stdout + stopped.stderr
+        order = ("inject", "last", "run", "stop")
+        # Refused until simulated time runs, which is a moment after the run is said to.
+        wait_until(lambda: self.cosmos(*order).returncode == 0, "stop", patience_s=PATIENCE_S)
         return process.communicate(timeout=PATIENCE_S)[1]
 
     def last_run(self):
