@@ -24,7 +24,7 @@ from cosmos_cli.evidence.run_directory import BUNDLE_SUFFIX, RUN_NAME
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from madns_runtime.bounded_files import FileRefused, read_regular_file, real_path
+from madns_runtime.bounded_files import read_regular_file, real_path
 
 if TYPE_CHECKING:  # importing the scenario's model takes longer than all that is done with it here
     from cosmos_cli.models.loading import ScenarioFile
@@ -77,11 +77,13 @@ class TreeFile:
                 if isinstance(self.source, bytes)
                 else read_regular_file(self.source, bytes_max=self.size_bytes)
             )
-        except FileRefused:  # it has grown, or a pipe has taken its place
+        except OSError:  # it is gone or has grown, or a pipe has taken its place
             content = None
         if content is None or hashlib.sha256(content).hexdigest() != self.sha256:
             raise MachineFailure(
-                FailureKind.DATA, f"{self.source!s} was changed while it was sent", "repeat"
+                FailureKind.DATA,
+                f"{self.source!s} was changed or removed while it was sent",
+                "repeat",
             )
         return content
 

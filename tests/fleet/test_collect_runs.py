@@ -103,9 +103,8 @@ def test_board_whose_disk_fills_during_a_run_is_named_and_its_records_are_cut_wh
 def test_board_whose_card_fails_during_a_run_is_named_and_keeps_what_it_has(operator):
     process = operator.start("worn", ENDLESS_S)
     boots = operator.tower.state()["boards"]["pi01"]["boots"]
-    operator.tower.run(
-        "pi01", "sync -f ."
-    )  # else a busy computer's card may not have the folder yet
+    # Else a busy computer's card may not have the folder yet.
+    operator.tower.run("pi01", "sync -f .")
     try:
         operator.tower.fault("pi01", "ro")
         talk = operator.stop(process)

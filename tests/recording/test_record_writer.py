@@ -528,9 +528,8 @@ def test_failing_disk_is_told_first_and_latest_and_not_tried_without_pause(tmp_p
     recorder.open_stream(PAIR)
     monkeypatch.setattr(stream_file.os, "write", refuse)
     recorder.record("pair", (1, 0.5))
-    started_s = (
-        time.monotonic()
-    )  # before its thread, which may have tried for long when this one goes on
+    # Before its thread, which may have tried for long when this one goes on.
+    started_s = time.monotonic()
     recorder.start()
     while len(calls) < 4:
         recorder.record("pair", (1, 0.5))

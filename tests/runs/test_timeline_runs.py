@@ -75,10 +75,8 @@ def test_a_stop_in_real_time_ends_all_agents_with_the_same_tick(cosmos, tmp_path
         tmp_path,
         [
             {"at_s": 0.2, "action": "stress", "agents": ["agent-01"], "for_s": 0.3},
-            {
-                "at_s": 5,
-                "action": "stop",
-            },  # long after the stress, which may begin late and end as late
+            # Long after the stress, which may begin late and end as late.
+            {"at_s": 5, "action": "stop"},
         ],
         mode="realtime",
         duration_s=60,

@@ -51,10 +51,8 @@ SCENARIO: dict[str, Any] = {
 LOSING: dict[str, Any] = {"timeouts": {"agents_ready_s": 90, "shutdown_s": 5}}
 """Machines are given up as soon as they are for users."""
 RETURNING = {
-    "timeouts": {
-        **LOSING["timeouts"],
-        "silence_s": 10,
-    },  # the others' agents may wait for a processor
+    # The others' agents may wait for a processor.
+    "timeouts": {**LOSING["timeouts"], "silence_s": 10},
     "on_agent_loss": "continue",
     "agents": {"count": 4, "tick_hz": 20, "restarts_max": 3},
 }

@@ -452,9 +452,18 @@ def test_tree_that_is_removed_while_it_is_read_is_not_whole(machine, monkeypatch
     assert not os.path.exists(top)
 
 
-def test_file_that_changes_while_it_is_sent_is_told(folder, machine):
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda file: file.write_text("gain = 3\n"),
+        lambda file: file.write_text("longer " * 1000),
+        lambda file: file.unlink(),
+    ],
+    ids=["changed", "grown", "gone"],
+)
+def test_file_that_changes_while_it_is_sent_is_told(folder, machine, harm):
     tree = the_tree(folder)
-    (folder / "flight.py").write_text("gain = 3\n")
+    harm(folder / "flight.py")
 
     with machine.board() as board, pytest.raises(MachineFailure, match="flight.py was changed"):
         send_tree(board, machine.layout, tree)
