@@ -250,9 +250,8 @@ def _check(path: Path) -> ProcessEntry | None:
         entry = None  # Not written by the process that the file is named after.
     if entry is not None and entry.node != platform.node():
         return None  # Of another machine that shares this directory: not ours to judge.
-    if (
-        read_start_ticks(os.getpid()) is None
-    ):  # out of descriptors, say: who lives is not to be known now
+    # One that does not see itself, out of descriptors, say, cannot tell who lives.
+    if read_start_ticks(os.getpid()) is None:
         return None if path.name.startswith(".") else entry
     is_dead = read_start_ticks(int(match[1])) != int(match[2])
     if is_dead or (entry is not None and not is_running(entry)):

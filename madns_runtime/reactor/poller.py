@@ -114,7 +114,7 @@ class EpollPoller:
     epoll's own timeout is in milliseconds; a timerfd among its descriptors wakes within tens of
     microseconds. It is set only when the deadline changes, and registered edge-triggered, so that it
     need not be read after it fired. Where deadlines follow each other at a period, it repeats by itself: to read it
-    then takes a quarter of what it takes to set it.
+    then takes less than to set it.
     """
 
     def __init__(self) -> None:

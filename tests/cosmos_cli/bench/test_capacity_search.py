@@ -27,24 +27,25 @@ def tried(search, capacity):
 
 
 @pytest.mark.parametrize(
-    ("first", "largest", "resolution", "capacity", "numbers", "held", "broken"),
+    ("search", "capacity", "numbers", "found"),
     [
-        (8, 5000, 0.0, 20, [8, 16, 32, 24, 20, 22, 21], 20, 21),
-        (8, 5000, 0.05, 100, [8, 16, 32, 64, 128, 96, 112, 104, 100], 100, 104),
-        (8, 5000, 0.05, 5, [8, 4, 6, 5], 5, 6),
-        (8, 5000, 0.05, 0, [8, 4, 2, 1], 0, 1),
-        (1, 5000, 0.05, 0, [1], 0, 1),
-        (8, 20, 0.05, 99, [8, 16, 20], 20, None),
-        (8, 20, 0.05, 18, [8, 16, 20, 18, 19], 18, 19),
-        (1, 1, 0.05, 9, [1], 1, None),
-        (8, 5000, 1.0, 20, [8, 16, 32], 16, 32),
+        ((8, 5000, 0.0), 20, [8, 16, 32, 24, 20, 22, 21], (20, 21)),
+        ((8, 5000, 0.05), 100, [8, 16, 32, 64, 128, 96, 112, 104, 100], (100, 104)),
+        ((8, 5000, 0.05), 5, [8, 4, 6, 5], (5, 6)),
+        ((8, 5000, 0.05), 0, [8, 4, 2, 1], (0, 1)),
+        ((1, 5000, 0.05), 0, [1], (0, 1)),
+        ((8, 20, 0.05), 99, [8, 16, 20], (20, None)),
+        ((8, 20, 0.05), 18, [8, 16, 20, 18, 19], (18, 19)),
+        ((1, 1, 0.05), 9, [1], (1, None)),
+        ((8, 5000, 1.0), 20, [8, 16, 32], (16, 32)),
     ],
 )
-def test_doubles_then_bisects(first, largest, resolution, capacity, numbers, held, broken):
+def test_doubles_then_bisects(search, capacity, numbers, found):
+    first, largest, resolution = search
     search = CapacitySearch(first=first, largest=largest, resolution=resolution)
 
     assert tried(search, capacity) == numbers
-    assert (search.held, search.broken) == (held, broken)
+    assert (search.held, search.broken) == found
 
 
 @pytest.mark.parametrize("capacity", range(0, 300, 7))

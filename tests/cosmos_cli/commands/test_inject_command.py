@@ -24,6 +24,7 @@ def inject(*words, options=("--quiet",)):
         return command.invoke(context)
 
 
+@pytest.mark.usefixtures("ordered")
 @pytest.mark.parametrize(
     ("words", "line", "is_carried_out_by_agents"),
     [
@@ -33,7 +34,7 @@ def inject(*words, options=("--quiet",)):
     ],
 )
 def test_what_an_agent_may_yet_refuse_is_not_told_as_in_force(
-    ordered, monkeypatch, capsys, words, line, is_carried_out_by_agents
+    monkeypatch, capsys, words, line, is_carried_out_by_agents
 ):
     monkeypatch.setattr(module, "order_action", lambda path, name, order: {"refusal": ""})
 

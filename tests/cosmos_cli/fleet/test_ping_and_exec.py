@@ -92,7 +92,7 @@ NO_LOGIN = (
 
 
 @pytest.mark.parametrize(
-    ("command", "does", "told"),
+    "case",
     [
         ("ping", *NO_LOGIN),
         ("facts", *NO_LOGIN),
@@ -100,10 +100,10 @@ NO_LOGIN = (
         ("exec", *NO_LOGIN),
         ("exec", "true", ("exit status 0",)),
     ],
+    ids=lambda case: f"{case[0]} {case[1].split()[0]}",
 )
-def test_user_who_may_run_no_commands_is_a_failure(
-    inventory, capsys, tmp_path, known_hosts, command, does, told
-):
+def test_user_who_may_run_no_commands_is_a_failure(inventory, capsys, tmp_path, known_hosts, case):
+    command, does, told = case
     with Sshd(tmp_path / "nologin", extra=f"ForceCommand {does}") as server:
         file = inventory(none=entry(server))
         with known_hosts.open("a") as known:

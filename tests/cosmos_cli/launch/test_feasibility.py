@@ -166,24 +166,20 @@ def test_breaks_at_is_where_it_first_does_not_hold(number, workers):
 
 
 @pytest.mark.parametrize(
-    ("number", "compute_s", "allowed_s", "latency_s", "workers", "breaks_at"),
+    ("number", "allowed_s", "offered", "breaks_at"),
     [
-        ("2.7", 0.1, 0.3, 0.0, 1, 4),
-        ("2.7", 0.1, 0.3, 0.1, 3, 7),
-        ("2.7", 0.1, 1.001, 0.001, 1, 11),
-        ("2.8", 0.1, 0.3, 0.0, 3, 10),
-        ("2.8", 0.1, 0.7, 0.1, 1, 6),
-        ("2.8", 0.1, 1.001, 0.0005, 7, 71),
+        ("2.7", 0.3, {"latency_s": 0.0, "workers": 1}, 4),
+        ("2.7", 0.3, {"latency_s": 0.1, "workers": 3}, 7),
+        ("2.7", 1.001, {"latency_s": 0.001, "workers": 1}, 11),
+        ("2.8", 0.3, {"latency_s": 0.0, "workers": 3}, 10),
+        ("2.8", 0.7, {"latency_s": 0.1, "workers": 1}, 6),
+        ("2.8", 1.001, {"latency_s": 0.0005, "workers": 7}, 71),
     ],
 )
-def test_sides_that_are_equal_but_for_rounding_hold(
-    number, compute_s, allowed_s, latency_s, workers, breaks_at
-):
+def test_sides_that_are_equal_but_for_rounding_hold(number, allowed_s, offered, breaks_at):
     # Decimals as people type them: none of these left sides is the right one in floats.
-    asked = demand(
-        batch_compute_s=compute_s, buffer_s=allowed_s, sync_compute_s=compute_s, lead_s=allowed_s
-    )
-    offered = resources(workers=workers, latency_s=latency_s)
+    asked = demand(batch_compute_s=0.1, buffer_s=allowed_s, sync_compute_s=0.1, lead_s=allowed_s)
+    offered = resources(**offered)
 
     last = inequality(number, agents=breaks_at - 1, asked=asked, offered=offered)
 

@@ -218,17 +218,17 @@ def test_arrays_and_numbers_that_are_not_finite_are_lists_and_null_in_the_json(
 
 
 @pytest.mark.parametrize(
-    ("document", "blocks", "fault"),
+    ("values", "fault"),
     [
-        ("'x'", "[]", "compare()'s document must return a mapping, got str"),
-        ("{}", "'table'", "compare() must give blocks as a list of Figure"),
+        ("document='x', blocks=[]", "compare()'s document must return a mapping, got str"),
+        ("document={}, blocks='table'", "compare() must give blocks as a list of Figure"),
     ],
 )
-def test_a_comparison_of_other_values_is_a_remark(drive, tmp_path, capsys, document, blocks, fault):
+def test_a_comparison_of_other_values_is_a_remark(drive, tmp_path, capsys, values, fault):
     drive(), drive(north_m=7.0)
     (tmp_path / "figures.py").write_text(
         "from madns_runtime.analysis.values import SimulationDifference\n"
-        f"def compare(a, b):\n    return SimulationDifference(document={document}, blocks={blocks})"
+        f"def compare(a, b):\n    return SimulationDifference({values})"
     )
 
     assert app.run(["diff", "1", "2", "--json", "--quiet"]) == 0
