@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import stat
@@ -11,8 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 SOCKET_MODE = 0o600
-SOCKET_PATH_BYTES_MAX = 100
-"""Of a path that every system takes; a longer one is reached through its folder's descriptor."""
+UNNAMED_SUFFIX = ".new"
+"""Behind the name of one that does not listen yet."""
+SOCKET_PATH_BYTES_MAX = 96
+"""Of a path that every system takes, also with that suffix; a longer one is reached through its folder's descriptor."""
 
 
 @contextlib.contextmanager
@@ -38,6 +41,8 @@ def listen(directory: str | Path, name: str, backlog: int) -> socket.socket:
     """
     Return a socket that listens, and never waits; one that an earlier process left at this name gives way.
 
+    It gets its name when it listens already: who finds it is let in.
+
     Raises:
         OSError: It cannot be made; see `socket_address`.
     """
@@ -46,10 +51,15 @@ def listen(directory: str | Path, name: str, backlog: int) -> socket.socket:
         with contextlib.suppress(OSError):  # where it can: so it holds from the first moment
             os.fchmod(listener.fileno(), SOCKET_MODE)
         with socket_address(directory, name) as address:
-            _remove_own_socket(address)
-            listener.bind(address)
-            os.chmod(address, SOCKET_MODE)
-        listener.listen(backlog)
+            unnamed = address + UNNAMED_SUFFIX
+            for left in (address, unnamed):
+                _remove_own_socket(left)
+            if os.path.lexists(address):
+                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), address)
+            listener.bind(unnamed)
+            os.chmod(unnamed, SOCKET_MODE)
+            listener.listen(backlog)
+            os.rename(unnamed, address)
     except OSError:
         listener.close()
         raise

@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 from harness.cosmos_command import CosmosCommand
 from harness.talking_process import TalkingProcess, find_marked
+from harness.waiting import wait_until
 from harness.wheel_cache import begin_cache
 from tower import Tower
 
@@ -76,8 +77,9 @@ class RunTower(TalkingProcess):
 
     def stop(self) -> None:
         """End the run in good order: what had to happen in it has happened."""
-        stopped = self.cosmos("inject", "last", "run", "stop")
-        assert stopped.returncode == 0, stopped.stdout + stopped.stderr
+        order = ("inject", "last", "run", "stop")
+        # Refused until simulated time runs, which is a moment after the run is said to.
+        wait_until(lambda: self.cosmos(*order).returncode == 0, "stop", patience_s=self.patience_s)
 
     def interrupt(self) -> None:
         self.signal(signal.SIGINT)

@@ -26,6 +26,7 @@ from harness.emulated_flight import (
 )
 from harness.firmware import needs_emulator
 from harness.talking_process import TalkingProcess, find_marked
+from harness.waiting import wait_until
 
 from madns_runtime.reactor.operator_link import OPERATOR_SIDE_GONE
 
@@ -112,8 +113,9 @@ class Fleet(TalkingProcess):
 
     def stop_run(self) -> None:
         """End the run in good order: what had to happen in it has happened."""
-        stopped = self.cosmos("inject", "last", "run", "stop")
-        assert stopped.returncode == 0, stopped.stdout + stopped.stderr
+        order = ("inject", "last", "run", "stop")
+        # Refused until simulated time runs, which is a moment after the run is said to.
+        wait_until(lambda: self.cosmos(*order).returncode == 0, "stop", patience_s=PATIENCE_S)
 
     # Faults -----------------------------------------------------------------------------------------
 
