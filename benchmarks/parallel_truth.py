@@ -164,7 +164,7 @@ def milliseconds(values: list[float]) -> dict[str, float]:
 def print_table(rows: list[dict[str, object]], propagator: str) -> None:
     """Print one line a fleet, window and executor."""
     forces = ", ".join(PROPAGATORS[propagator].forces)
-    print(f"{propagator}, {forces}; knots of 1 s; ms a window: median (least)\n")
+    print(f"{propagator}, {forces}; knots of 1 s; ms per window: median (least)\n")
     print("vehicles  window  who                     window         carrying alone  identical")
     for row in rows:
         head = f"{row['vehicles']:>8}  {row['window_s']:>4} s "

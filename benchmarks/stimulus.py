@@ -72,7 +72,7 @@ def main() -> None:
     )
     parser.add_argument("--seconds", type=float, default=120.0, help="simulated, of each line")
     seconds = parser.parse_args().seconds
-    print(f"{'source':20} {'tick Hz':>8} {'rate Hz':>8} {'us a tick':>10} {'most us':>9}")
+    print(f"{'source':20} {'tick Hz':>8} {'rate Hz':>8} {'us per tick':>10} {'most us':>9}")
     for source in SOURCES:
         for tick_hz, rate_hz in ((10.0, 10.0), (100.0, 100.0), (10.0, 100.0)):
             mean_us, most_us = us_per_tick(source, tick_hz, rate_hz, seconds)

@@ -4,7 +4,7 @@ Propagators of truth side by side in one run, and Basilisk as anybody would buil
     python benchmarks/truth.py [--counts 10,93,1000,5000] [--rounds 7] [--json]
     python benchmarks/truth.py --accuracy
 
-One batch is 10 s with 100 states a vehicle, under two-body and J2 forces; at a step of 1 s Basilisk
+One batch is 10 s with 100 states per vehicle, under two-body and J2 forces; at a step of 1 s Basilisk
 gives 10 states. Simulations are built, machine code compiled and element sets parsed before anything
 is timed. Contenders alternate, so that what else the machine does hits all; medians are shown, and how
 many times the default's they are. Basilisk stands there twice: `rigid` is its spacecraft as it comes,
@@ -223,7 +223,7 @@ def timed_ms(act: Callable[[], object]) -> float:
 def print_times(times_ms: Times) -> None:
     """Print medians, and how many times the default's they are."""
     print(
-        "One batch: 10 s, 100 states a vehicle (Basilisk at 1 s: 10); median ms (times the default)"
+        "One batch: 10 s, 100 states per vehicle (Basilisk at 1 s: 10); median ms (times the default)"
     )
     names = list(dict.fromkeys(name for row in times_ms.values() for name in row))
     print(f"  {'vehicles':24}" + "".join(f"{count:>20}" for count in times_ms))

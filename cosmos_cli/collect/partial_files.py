@@ -116,7 +116,7 @@ class PartialFiles:
         Bring whole files to the disk and to their names; take away what came wrong.
 
         Returns:
-            One line a file that cannot be put in its place, starting with its path.
+            One line per file that cannot be put in its place, starting with its path.
 
         Raises:
             MachineFailure: The disk here fails.

@@ -74,9 +74,9 @@ def ps(
     ] = None,
     inventory: SomeInventoryOption = None,
     limit: LimitOption = None,
-    all_: Annotated[bool, typer.Option("--all", help="A line an agent, not only their number.")] = (
-        False
-    ),
+    all_: Annotated[
+        bool, typer.Option("--all", help="A line per agent, not only their number.")
+    ] = (False),
     forks: ForksOption = FORKS_DEFAULT,
     accept_new_host_keys: AcceptHostKeysOption = False,
     json: JsonOption = False,

@@ -4,7 +4,7 @@ A comparison as JSON: what `cosmos diff --json` prints, schema 1. Pure.
     schema, runs {a, b}, same, identical
     settings, versions, summaries    lists of {key, a, b}; null where a run does not have the key
     timing                           {key of run.json: [a, b]}
-    streams                          one a stream: {table, by, rows [a, b], matched, identical, only_a, only_b, fields,
+    streams                          one per stream: {table, by, rows [a, b], matched, identical, only_a, only_b, fields,
                                      fields_only_a, fields_only_b, sources}; sources hold the same of each agent or machine
         only_a, only_b               {count, first {key, who}, last {key, who}}
         fields                       {name: {unit, different, compared, null_in_one, rms, max, at {key, who}, first, values}}

@@ -16,7 +16,7 @@ BUSY_PROCESSORS_WARNING = 0.5
 BUSY_PROCESSORS_NOTE = 0.1
 STEAL_SHARE_WARNING = 0.01
 TICKS_A_PROCESSOR_HZ_MAX = 4500.0
-"""Empty steps, one process an agent, on a processor of a server (measured: 93 agents at 100 Hz on two)."""
+"""Empty steps, one process per agent, on a processor of a server (measured: 93 agents at 100 Hz on two)."""
 LIMITS = "/etc/security/limits.d/90-cosmos.conf"
 
 

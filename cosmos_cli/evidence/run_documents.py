@@ -16,7 +16,7 @@ from madns_runtime.config import RunConfig, from_mapping
 from madns_runtime.errors import ConfigurationError
 
 DOCUMENT_BYTES_MAX = 256 * 1024 * 1024
-"""A host's result is some kilobytes an agent, a manifest some 200 bytes a file."""
+"""A host's result is some kilobytes per agent, a manifest some 200 bytes per file."""
 SCHEMA = 1
 """Version of run.json and manifest.json; a change that breaks a reader raises it."""
 EXPECTATIONS = "expectations"

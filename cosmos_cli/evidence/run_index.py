@@ -1,7 +1,7 @@
 """
 Places of this user's runs by name, so that one that goes on by itself is found from any shell.
 
-It lies beside the register of processes. One small file a run; an entry whose directory is gone is removed when it is met. That the index cannot
+It lies beside the register of processes. One small file per run; an entry whose directory is gone is removed when it is met. That the index cannot
 be written is no reason to fail: a run is still found in its folder.
 """
 

@@ -41,7 +41,7 @@ class Sending:
         """Return how many of one sender's messages an interval of that length has to carry at worst."""
         if length_s < self.within_s * (1.0 - ROUNDING):
             return 0
-        # Ten tenths of a second add up to a little less than a second, in which messages of one a second count as well.
+        # Ten tenths of a second add up to a little less than a second, in which messages of one per second count as well.
         return max(1, math.floor((length_s - self.within_s) * self.rate_hz + ROUNDING) + 1)
 
 

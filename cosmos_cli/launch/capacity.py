@@ -153,14 +153,14 @@ class _ProcessorLoad:
         return math.ceil(agents / sum(each.has_agents for each in self.computers))
 
     def agents_s(self, agents: int, per_process: int) -> float:
-        """Return the processor time of agents on one machine, s a second, at speed 1."""
+        """Return the processor time of agents on one machine, s per second, at speed 1."""
         full, rest = divmod(agents, per_process)
         packs = full * math.ceil(per_process / PACK_AGENTS_MAX) + math.ceil(rest / PACK_AGENTS_MAX)
         ticks_s = agents * (self.costs.tick_s + self.demand.step_s)
         return (packs * self.costs.wake_up_s + ticks_s) * self.tick_hz
 
     def truth_s(self, agents: int) -> float:
-        """Return what the host's workers compute for so many agents, s a second, at speed 1."""
+        """Return what the host's workers compute for so many agents, s per second, at speed 1."""
         buffer_s = self.demand.buffer_s
         if buffer_s <= 0.0 or math.isinf(buffer_s):
             return 0.0
@@ -171,7 +171,7 @@ class _ProcessorLoad:
         return Limit(
             name="host's loop",
             agents=math.floor(SHARE_USABLE / each_s),
-            why=f"{self.costs.exchange_s * 1e6 / self.host.speed:.0f} us an agent and tick, in one thread",
+            why=f"{self.costs.exchange_s * 1e6 / self.host.speed:.0f} us per agent and tick, in one thread",
         )
 
     def one_process(self) -> Limit:

@@ -38,7 +38,7 @@ STDERR_LINES = 10
 STDERR_BYTES = 8192
 
 ENVIRONMENT: Mapping[str, str] = {
-    # One thread a process: numpy's own pools would contend with the loops for the processors.
+    # One thread per process: numpy's own pools would contend with the loops for the processors.
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",

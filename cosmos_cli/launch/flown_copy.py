@@ -187,7 +187,7 @@ def _kind(entry: os.DirEntry[str], path: Path, top: Path) -> str:
 def _too_large(name: str, size: int) -> str:
     return (
         f"{clean_line(name)} was too large and left out: {size / MEGABYTE:.1f} MB; a copy has at most"
-        f" {FILE_BYTES_MAX // MEGABYTE} MB a file and {COPY_BYTES_MAX // MEGABYTE} MB in all"
+        f" {FILE_BYTES_MAX // MEGABYTE} MB per file and {COPY_BYTES_MAX // MEGABYTE} MB in all"
     )
 
 

@@ -19,7 +19,7 @@ class StressReport:
     """Work done by the workers."""
 
     factored: tuple[int, ...]
-    """Numbers factorised, one entry a worker."""
+    """Numbers factorised, one entry per worker."""
     errors: tuple[str, ...] = ()
 
 

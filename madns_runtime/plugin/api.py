@@ -146,7 +146,7 @@ class Context(Protocol):
         """Declare a record stream; call it in `setup`."""
 
     def record(self, stream: str, values: Sequence[Any]) -> None:
-        """Record one value a field. Never blocks; what does not fit is counted."""
+        """Record one value per field. Never blocks; what does not fit is counted."""
 
     def keep_text(self, name: str, data: bytes) -> None:
         """

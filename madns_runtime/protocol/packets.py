@@ -10,7 +10,7 @@ from typing import Final
 
 ACK_DELAY_MAX_S: Final = 0.015
 """The longest that an acknowledgement waits for a datagram to ride in; more than a tick of 100 Hz, so that
-a message a tick costs one acknowledgement in two."""
+a message per tick costs one acknowledgement in two."""
 ACK_DELAY_UNIT_S: Final = 1e-5
 ACK_DELAY_UNITS_MAX: Final = 0xFFFF
 """This value says: that long or longer; such an acknowledgement gives no round trip."""

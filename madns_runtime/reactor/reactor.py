@@ -96,7 +96,7 @@ def _take_note(signum: int, frame: FrameType | None) -> None:
 
 class Reactor:
     """
-    One epoll loop a process, with all timers behind one timerfd.
+    One epoll loop per process, with all timers behind one timerfd.
 
     Exceptions of callbacks leave `run`; what was due besides is still due, and `run` may be called
     again. After a fork the child must `close` its copy first; that leaves the parent's untouched.

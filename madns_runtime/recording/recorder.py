@@ -100,7 +100,7 @@ class Recorder:
 
     def record(self, stream: str, values: Sequence[Any] | Mapping[str, Any]) -> None:
         """
-        Record one value a field; a mapping holds them by name. Never blocks, but where its writer does.
+        Record one value per field; a mapping holds them by name. Never blocks, but where its writer does.
 
         Object streams take more names than the schema has. NaN and infinity become null and are counted.
 

@@ -169,7 +169,7 @@ class StreamFile:
             values = values.tolist() if values.ndim else (values.item(),)
         elif isinstance(values, str | bytes) or not isinstance(values, Sequence):
             raise PluginError(
-                f"stream {self.schema.name}: expected one value a field, got {type(values).__name__}"
+                f"stream {self.schema.name}: expected one value per field, got {type(values).__name__}"
             )
         if len(values) != self.width:
             raise self.width_error(len(values))

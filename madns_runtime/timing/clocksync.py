@@ -241,7 +241,7 @@ class ClockEstimate:
         served = self._served or self._known()
         if local_s > self._asked_s:
             self._asked_s = local_s
-        # As `offset_at` has it, without a call: several times a tick.
+        # As `offset_at` has it, without a call: several times per tick.
         since_s = local_s - served.anchor_s
         slewing_s = served.slewing_s
         if since_s < slewing_s:

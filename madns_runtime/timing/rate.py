@@ -50,7 +50,7 @@ class LatenessHistogram:
     """
     A running estimate of percentiles in bounded memory, for live display.
 
-    Whole microseconds up to 31, then 16 buckets an octave: a percentile reads at most 1/16 too high.
+    Whole microseconds up to 31, then 16 buckets per octave: a percentile reads at most 1/16 too high.
     Exact statistics are made from the records.
     """
 

@@ -146,8 +146,8 @@ def test_its_tables_of_interfaces_are_those_of_the_code():
 
 def test_its_bounds_are_those_of_the_code():
     assert f"At most {commands.COMMANDS_PER_TICK_MAX} commands" in GUIDE
-    assert f"{flight_context.MESSAGES_PER_TICK_MAX} messages a tick" in GUIDE
-    assert f"{flight_context.PAYLOAD_BYTES_MAX:,} bytes a message" in GUIDE
+    assert f"{flight_context.MESSAGES_PER_TICK_MAX} messages per tick" in GUIDE
+    assert f"{flight_context.PAYLOAD_BYTES_MAX:,} bytes per message" in GUIDE
     assert f"{asked_ticks.UNANSWERED_MAX} ticks unanswered" in GUIDE
     text = " ".join(GUIDE.split())
     assert f"`agents/NAME/{process.STDERR_TEXT}.txt`" in text

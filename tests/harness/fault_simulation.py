@@ -14,7 +14,7 @@ HEARD = (Field("t_s"), Field("who", "", "str"), Field("what", "", "json"))
 
 
 class FaultHost(HostSimulation):
-    """Sends every agent one message a period, and records what it hears."""
+    """Sends every agent one message per period, and records what it hears."""
 
     def setup(self, context):
         self.context = context
@@ -47,7 +47,7 @@ class FaultHost(HostSimulation):
 
 
 class FaultAgent(AgentSimulation):
-    """Sends one message a tick to the host, and one to all agents, and records what it hears."""
+    """Sends one message per tick to the host, and one to all agents, and records what it hears."""
 
     def setup(self, context, initial):
         self.context = context

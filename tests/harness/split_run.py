@@ -22,7 +22,7 @@ SESSION = "00112233445566ff"
 
 
 class SplitRun:
-    """A whole run of some agents a machine; what is not on a machine is in the run directory."""
+    """A whole run of some agents per machine; what is not on a machine is in the run directory."""
 
     def __init__(
         self, root: Path, machines: int = 2, *, agents_each: int = 1, ticks: int = 200

@@ -119,7 +119,7 @@ def test_peer_that_lies_in_every_field_costs_bounded_memory_and_no_standstill(se
         timer_s = host.get_timer()
         assert timer_s is None or timer_s > now_s
         assert all(len(data) <= DATAGRAM_BYTES_MAX for data in datagrams)
-        # One unfinished message a stream is held, fed by what the windows let in, and they let in little.
+        # One unfinished message per stream is held, fed by what the windows let in, and they let in little.
         assert host.held_bytes <= STEPS * 4 * 204
         for stream in host._incoming.streams:
             assert len(stream._held) <= stream.window

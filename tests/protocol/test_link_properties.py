@@ -335,6 +335,6 @@ def test_silent_peer_costs_a_bounded_trickle():
 
     wire.run_for(600.0)
 
-    # Both streams' first windows, then one datagram a second for each.
+    # Both streams' first windows, then one datagram per second for each.
     assert 1000 < len(wire.carried) < 1300
     assert not wire.agent.link.is_flushed

@@ -209,7 +209,7 @@ def test_unknown_stream_is_named_with_the_known_ones(tmp_path):
         (np.zeros(3), "got 3"),
         ({"number": 1}, "missing value_m"),
         ({"number": 1, "value_m": 2.0, "extra": 3, "more": 4}, "unknown extra, more"),
-        ("ab", "expected one value a field, got str"),
+        ("ab", "expected one value per field, got str"),
         ((1, object()), "stream pair: value 1: object has no JSON form"),
         ((1 << 70, 1.0), "stream pair: value 0"),
         ({"number": 1, "value_m": b"x"}, "value 1: bytes has no JSON form"),

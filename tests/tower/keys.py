@@ -1,4 +1,4 @@
-"""Ed25519 keys in OpenSSH's formats, without starting ssh-keygen once a board."""
+"""Ed25519 keys in OpenSSH's formats, without starting ssh-keygen once per board."""
 
 from __future__ import annotations
 

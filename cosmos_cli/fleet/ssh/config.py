@@ -209,7 +209,7 @@ def matches(patterns: Sequence[str], name: str) -> bool:
 def _fits(pattern: str, name: str) -> bool:
     if "*" in pattern or "?" in pattern:
         return glob_of(pattern).fullmatch(name) is not None
-    return pattern == name  # most are plain names, one a machine
+    return pattern == name  # most are plain names, one per machine
 
 
 @functools.lru_cache(maxsize=4096)

@@ -117,7 +117,7 @@ class SshSocket:
 
 def connect_tcp(host: str, port: int, *, timeout_s: float) -> SshSocket:
     """
-    Connect without Nagle's delay, which would cost SSH 40 ms a command.
+    Connect without Nagle's delay, which would cost SSH 40 ms per command.
 
     Raises:
         OSError: Of the last address that the name stands for.

@@ -83,7 +83,7 @@ class ConstellationAgent(AgentSimulation):
         self._mu_m3_s2 = GRAVITY_MODELS[parameters.gravity].mu_m3_s2
         record, tick_hz = parameters.record, context.tick_hz
         self._elements_ticks = RecordedTicks(record.elements_hz, tick_hz)
-        # A day at 1 Hz is 8 MB an agent: long runs may record less than every tick.
+        # A day at 1 Hz is 8 MB per agent: long runs may record less than every tick.
         self._state_ticks = RecordedTicks(record.state_hz or tick_hz, tick_hz)
         self._state_tick = 0
         self._elements_tick = 0

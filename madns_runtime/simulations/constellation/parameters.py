@@ -76,7 +76,7 @@ class KeplerianSatellites:
     """Satellites from osculating elements written in the scenario."""
 
     keplerian: Annotated[tuple[KeplerianOrbit, ...], MinLen(1)]
-    """One entry a satellite."""
+    """One entry per satellite."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

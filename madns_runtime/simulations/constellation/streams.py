@@ -197,7 +197,7 @@ INVARIANTS = (
     Field("energy_drift", "1"),
     Field("momentum_z_drift", "1"),
 )
-"""One record a vehicle and window; drifts are relative to simulated time zero or to the end of the last
+"""One record per vehicle and window; drifts are relative to simulated time zero or to the end of the last
 maneuver, and missing where there is none in the window to compare with."""
 
 SLOTS = (
@@ -215,7 +215,7 @@ SLOT_ERRORS = (
     Field("agent", "", "str"),
     Field("slot_error_deg", "deg"),
 )
-"""One record a satellite of those: how far it is ahead of its slot by truth, the common phase being that of all."""
+"""One record per satellite of those: how far it is ahead of its slot by truth, the common phase being that of all."""
 
 SAMPLE = (Field("tick", "", "int"), Field("t_s", "s"))
 """The first fields of every instrument: when it measured."""

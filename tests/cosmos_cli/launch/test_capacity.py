@@ -30,7 +30,7 @@ def limit(capacity, name):
 
 
 def test_one_computer_bears_host_and_agents():
-    # 1.6 s a second; an agent's ticks take 100 x (100 + 100) us, its host 100 x 50 us.
+    # 1.6 s per second; an agent's ticks take 100 x (100 + 100) us, its host 100 x 50 us.
     assert limit(predicted(), "processors of here") == 1.6 // (0.02 + 0.005)
     assert limit(predicted(), "host's loop") == 160
     assert predicted().binding.name == "processors of here"

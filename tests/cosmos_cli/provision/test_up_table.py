@@ -1,4 +1,4 @@
-"""What `cosmos up` prints: plans, differences, a line a machine, the verdict; and its progress."""
+"""What `cosmos up` prints: plans, differences, a line per machine, the verdict; and its progress."""
 
 import io
 import json

@@ -159,7 +159,7 @@ def test_drawn_orbit_passes_through_the_flown_one(tmp_path):
 def test_orbits_of_a_long_run_are_drawn_as_orbits_and_what_is_left_out_is_told(
     tmp_path, ticks, is_cut
 ):
-    # A record every 50 s, 6026 s an orbit.
+    # A record every 50 s, 6026 s per orbit.
     config = make_config(1, ticks=ticks, tick_hz=0.02)
     _, sections = build(SyntheticRun(tmp_path, config).write(with_states=True))
 

@@ -60,7 +60,7 @@ ERROR_M, TICKS, TICK_HZ = 3.0, 100, 10.0
 
 
 def record(made):
-    """Two maneuvers and four messages an agent; measurements are 3 m off and known a tick late."""
+    """Two maneuvers and four messages per agent; measurements are 3 m off and known a tick late."""
     host = made.recorder("host", "host", MANEUVERS, LINKS, CONTACTS)
     host.record("contacts", ("rise", "agent-01", "Kiruna", 1.0, None, None))
     host.record("contacts", ("set", "agent-01", "Kiruna", 1.0, 9.0, 42.0))

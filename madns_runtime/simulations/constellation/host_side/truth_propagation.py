@@ -91,7 +91,7 @@ class TruthSupply:
     Args:
         context: Whose executor works.
         store: Where truth is kept.
-        propagation: Settings; what is one a vehicle is the supply's.
+        propagation: Settings; what is one per vehicle is the supply's.
         vehicles: What they are like.
     """
 

@@ -2,7 +2,7 @@
 Mean elements of near-circular orbits: what remains when J2's short-period swing is taken away.
 
 The osculating semi-major axis of a satellite at 780 km swings by 18 km in an orbit, its mean one stays.
-Plain floats and one state at a time, as in `elements`; 20 us a call. Pure; SI units and rad.
+Plain floats and one state at a time, as in `elements`; 20 us per call. Pure; SI units and rad.
 
 First order in J2 after Brouwer (1959), in elements that have a meaning at e = 0: the terms of Lyddane's
 modification for e -> 0, besides the semi-major axis, which is right for any e. What is left out is of

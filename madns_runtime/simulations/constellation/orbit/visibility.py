@@ -37,7 +37,7 @@ def has_line_of_sight(first: Sequence[float], second: Sequence[float], height_m:
     """
     Return whether the straight line between two positions stays above a height over the ellipsoid.
 
-    Plain numbers: this is asked once a message, where arrays of three would cost ten times as much.
+    Plain numbers: this is asked once per message, where arrays of three would cost ten times as much.
 
     Args:
         first: Position, m; further numbers are ignored.

@@ -327,7 +327,7 @@ def split(request: StretchRequest, parameters: PropagationParameters, parts_max:
 
     Args:
         request: All vehicles.
-        parameters: What is one a vehicle is in the order of the request.
+        parameters: What is one per vehicle is in the order of the request.
         parts_max: Parts wanted, at least 1: the workers, N_p.
     """
     is_independent = parameters.settings.PROPERTIES.is_independent

@@ -77,7 +77,7 @@ def propagate_vehicle(request: VehicleRequest, parameters: PropagationParameters
 
     Args:
         request: What is wanted.
-        parameters: Settings and constants; names has this vehicle's, what else is one a vehicle is the
+        parameters: Settings and constants; names has this vehicle's, what else is one per vehicle is the
             request's.
 
     Raises:

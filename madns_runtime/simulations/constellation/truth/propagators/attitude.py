@@ -91,7 +91,7 @@ def propagate_attitude(
             TEME to body), body rates (rad/s).
         t0_s: Simulated time of *states*, s.
         knots_s: Times, shape (K,), s, ascending, none before t0_s.
-        parameters: Of the orbit; what is one a vehicle is in the order of *bodies*.
+        parameters: Of the orbit; what is one per vehicle is in the order of *bodies*.
 
     Returns:
         Shape (M, K, 13); quaternions of unit length, their signs continuous from *states* on.
