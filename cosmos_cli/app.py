@@ -211,7 +211,7 @@ def _flushed(code: int) -> int:
 
 
 def _leave_quietly() -> int:
-    """Whoever read our output has gone, as `head` does; the interpreter must not complain at exit."""
+    """The reader of our output has gone, as `head` does; the interpreter must not complain at exit."""
     let_go_of_output()
     return EXIT_CODE_UNREAD
 

@@ -18,4 +18,4 @@ class AgentParameters:
     agents: Annotated[tuple[str, ...], MinLen(1)]
     """Names of agents, or globs such as sat-0*; second names do as well."""
     parameters: Mapping[str, Any]
-    """What differs from the scenario's parameters: mappings merge, lists and scalars replace."""
+    """Differences from the scenario's parameters: mappings merge, lists and scalars replace."""

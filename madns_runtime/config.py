@@ -169,7 +169,7 @@ class Recording(ScenarioSection):
     buffer_bytes: Annotated[int, Ge(65_536)] = 4 * 1024 * 1024
     """Bound of the buffer between loop and disk; what does not fit is dropped and counted."""
     access: Literal["private", "group", "all"] | None = None
-    """Who may read the run's folder, its package and what it records on machines: private (its owner), group, or all. Not given: as COSMOS_ACCESS says, else private."""
+    """Readers of the run's folder, its package and what it records on machines: private (its owner), group, or all. Not given: as COSMOS_ACCESS says, else private."""
     not_finite_max: Annotated[int, Ge(0)] = 0
     """Values of all records that may be NaN or infinite: more break the check records.not_finite. A value that is not there is null (None), which is no such value."""
     verbosity: Annotated[int, Ge(0), Le(5)] = 4
@@ -301,7 +301,7 @@ class RunConfig:
     conditions: tuple[Condition, ...] = ()
     """On recorded values, each evaluated by whoever records them."""
     timeline: tuple[ScheduledEntry, ...] = ()
-    """What is to happen, and when."""
+    """Events of the run, and when each is to happen."""
 
     @property
     def longest_s(self) -> float:

@@ -22,7 +22,7 @@ FLAGS = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 MODE = 0o666
 """By the umask, as of any file."""
 STREAM_WORD = Path("-")
-"""What many programs take for stdout."""
+"""Path that many programs take for stdout."""
 
 
 def create_partial(path: Path, *, takes_over: bool) -> tuple[Path, int]:

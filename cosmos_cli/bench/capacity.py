@@ -23,7 +23,7 @@ TRIALS_MAX: Final = 64
 RUN_LIMIT_S: Final = 600.0
 """For one trial beyond its simulated time: start, end, records and verdict of thousands of agents."""
 SCENARIO: Final = Path(__file__).parent / "data" / "capacity.yaml"
-"""What is tried unless another scenario is named."""
+"""The scenario that is tried unless another is named."""
 COLUMNS = (
     Column("agents", is_number=True),
     Column("budget"),
@@ -131,7 +131,7 @@ class CapacityFound:
     search: CapacitySearch
     trials: list[CapacityTrial] = field(default_factory=list)
     stopped_by: str = ""
-    """What ended it before its time; empty for nothing."""
+    """The reason why it ended before its time; empty if it did not."""
     exit_code: ExitCode = ExitCode.OK
 
     @property

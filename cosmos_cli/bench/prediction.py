@@ -21,7 +21,7 @@ class CapacityPrediction:
     agents: int | None
     """None where the plan sees no limit."""
     source: str
-    """What limits it, in a few words."""
+    """The limit, in a few words."""
 
 
 def predict(

@@ -70,7 +70,7 @@ class Trial:
 
     @property
     def launches(self) -> list[DeviceLaunch]:
-        """What drives all of them."""
+        """Return the launches that drive all of them."""
         return [*self.here, *(each for launches in self.there.values() for each in launches)]
 
     def sample_there(

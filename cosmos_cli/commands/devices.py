@@ -45,7 +45,7 @@ LISTED = (Column("machine"), Column("device"), Column("kind"), Column("rate Hz",
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Wish:
-    """What is asked for: an action, or "" for a list, and its words and options."""
+    """The words of the command: an action, or "" for a list, and its words and options."""
 
     action: str
     names: Sequence[str]

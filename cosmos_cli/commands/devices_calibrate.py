@@ -73,7 +73,7 @@ COLUMNS: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationWish:
-    """What is to be calibrated, and by what."""
+    """The calibration that is asked for: of which device, and against what."""
 
     device: str
     """Its name; in the scenario it stands by that."""

@@ -1,4 +1,4 @@
-"""What commands on machines have in common: their options, and their end with what failed and how to repeat it."""
+"""Common parts of commands on machines: their options, and their end with what failed and how to repeat it."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def plan(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Outlook:
-    """What real time asks of a plan's computers, and whether they can bear it; nothing is asked in lockstep."""
+    """The load of real time on a plan's computers, and whether they can bear it; nothing is asked in lockstep."""
 
     resources: Resources
     latency_source: str

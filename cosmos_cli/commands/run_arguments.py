@@ -1,4 +1,4 @@
-"""What commands about runs have in common: which run is meant, and in which folder of runs."""
+"""Common parts of commands about runs: which run is meant, and in which folder of runs."""
 
 from __future__ import annotations
 

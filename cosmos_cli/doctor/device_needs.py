@@ -1,4 +1,4 @@
-"""What a machine's devices need there and is missing: what it is asked, and what its answers mean. Pure."""
+"""Needs of a machine's devices that are missing there: the questions to it, and the meaning of its answers. Pure."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def open_files(case: Case) -> Iterator[CheckRemark]:
 
 
 def devices(case: Case) -> Iterator[CheckRemark]:
-    """What devices need, of this computer and of machines, as the inventory lists them, is there."""
+    """All that devices need, of this computer and of machines, as the inventory lists them, is there."""
     for item in case.part("here").get("devices") or case.told.get("devices") or ():
         for missing in item["missing"]:
             yield CheckRemark(

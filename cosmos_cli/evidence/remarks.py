@@ -27,7 +27,7 @@ from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field
 
 REMARKS_MAX = 20
 QUEUE_MIB = LinkLimits().send_queue_bytes_max // 2**20
-"""What may wait for one agent."""
+"""Room for what waits to be sent to one agent, MiB."""
 NOT_DECLARED = "not declared by the simulation's streams()"
 
 Declared = Mapping[tuple[str, str], DeclaredStream]

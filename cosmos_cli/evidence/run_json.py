@@ -66,7 +66,7 @@ class Evidence:
     """Machine of the host; None when it was this computer."""
     machine_of_agent: Mapping[str, str] = field(default_factory=dict)
     devices: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """What became of each device, by its full name."""
+    """Outcome of each device, by its full name."""
     interrupted: bool = False
     problems: tuple[Problem, ...] = ()
     missing: tuple[str, ...] = ()

@@ -54,7 +54,7 @@ class RecordFile:
     schema: int = SCHEMA_VERSION
     """Version of how it is written."""
     stray: str = ""
-    """Whose records these are by their schema line, where that is not what the file's place says."""
+    """Name of their source by their schema line, where that is not what the file's place says."""
 
     @property
     def table(self) -> str:

@@ -33,7 +33,7 @@ class CheckResult:
     got: float | None
     passed: bool
     worst: str | None = None
-    """Whose value is the worst, where there are many: an agent, the host, a stream. Of the framework's checks `got` is of
+    """Source of the worst value, where there are many: an agent, the host, a stream. Of the framework's checks `got` is of
     all of them together, of others it is this one's."""
     agent: str | None = None
     """Of an expectation: the agent of this value, or host."""
@@ -42,7 +42,7 @@ class CheckResult:
     unit: str | None = None
     """Unit of limit and value; None for the framework's own checks and a simulation's."""
     expected: str = ""
-    """What is expected, in words; empty for others than expectations."""
+    """Words for what is expected; empty for others than expectations."""
     agents_broken: int = 0
     """Agents that break it."""
 

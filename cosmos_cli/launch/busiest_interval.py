@@ -52,7 +52,7 @@ class BusiestInterval:
     length_s: float
     """Infinity if the average over a long time is the most."""
     bytes_s: float
-    """What it carries, over its length."""
+    """Load within it, over its length."""
 
 
 def busiest_interval(sendings: Sequence[Sending], agents: float) -> BusiestInterval:

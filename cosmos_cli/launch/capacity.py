@@ -26,7 +26,7 @@ PACK_AGENTS_MAX = 8
 SHARE_USABLE = 0.8
 """Of a processor: above, ticks wait for each other more often than budgets of missed ticks allow."""
 SKB_OVERHEAD_BYTES, SKB_TAIL_BYTES, SKB_HEADER_BYTES = 256, 320, 64
-"""What Linux adds to a datagram that waits in a socket; it rounds up to powers of two."""
+"""Bytes that Linux adds to a datagram that waits in a socket; it rounds up to powers of two."""
 TICK_BYTES = 64
 """An agent's best-effort message, where the simulation names no flow."""
 

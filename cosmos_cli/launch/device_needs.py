@@ -1,4 +1,4 @@
-"""What a device needs and this computer has not, each with its cure."""
+"""Needs of devices that this computer does not meet, each with its cure."""
 
 from __future__ import annotations
 

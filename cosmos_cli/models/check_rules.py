@@ -65,7 +65,7 @@ class CheckRule(BoundsRule):
     agents: tuple[NonBlank, ...] = ()
     """Names, labels or globs of agents; host for the host's half. Not given: all agents, or the host's half where it alone records the stream."""
     statistic: Statistic | None = None
-    """What of the values is compared; each if not given, last with at_end."""
+    """Which of the values are compared; each if not given, last with at_end."""
     unit: str = ""
     """Unit of the limit, or of the bounds under `when`; the field's own if not given."""
     when: BoundsRule | None = None

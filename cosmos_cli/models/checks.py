@@ -32,7 +32,7 @@ EVENT_FIELD = "event"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surroundings:
-    """What checks are about."""
+    """Subjects of checks."""
 
     agents: tuple[str, ...]
     labels: AgentLabels

@@ -79,7 +79,7 @@ class DeviceQuestion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KindAnswer:
-    """What a kind says to one device's parameters."""
+    """Answers of a kind to one device's parameters."""
 
     faults: tuple[Fault, ...] = ()
     """With any of them the rest is not known."""

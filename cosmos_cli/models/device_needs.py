@@ -1,4 +1,4 @@
-"""What machines need for their devices: for those that hang on them, and for those that a scenario gives its agents."""
+"""Needs of machines for their devices: for those that hang on them, and for those that a scenario gives its agents."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class DeviceNeeds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineNeeds:
-    """What one machine needs for all its devices; each thing once, in the order of the devices."""
+    """Needs of one machine for all its devices; each thing once, in the order of the devices."""
 
     devices: tuple[DeviceNeeds, ...] = ()
     driver_files: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""What is wrong with the channels of devices that a simulation's parameters name, as far as no inventory is needed."""
+"""Faults in the channels of devices that a simulation's parameters name, as far as no inventory is needed."""
 
 from __future__ import annotations
 

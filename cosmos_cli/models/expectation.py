@@ -16,7 +16,7 @@ TIMES_MAX: Final = 2**53
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldBounds:
-    """What has to hold meanwhile for a record to count."""
+    """Condition that has to hold meanwhile for a record to count."""
 
     stream: str
     field: str
@@ -31,7 +31,7 @@ class Expectation:
 
     name: str
     words: str
-    """What is expected, such as `max of drive.error_m below 0.5 m`."""
+    """Words for what is expected, such as `max of drive.error_m below 0.5 m`."""
     stream: str
     field: str = ""
     """Empty for a count of records."""

@@ -1,4 +1,4 @@
-"""What is wrong with the devices of a scenario, as far as that can be told without an inventory."""
+"""Faults in the devices of a scenario, as far as that can be told without an inventory."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ WORDS = {EVENT_PLACE: EVENT_WORDS, (LOG.name, "level"): tuple(LOG_LEVELS)}
 """All texts that a field of a stream of the framework's ever holds."""
 Role = Literal["agent", "host", "machine", "device"]
 APART: tuple[Role, ...] = ("machine", "device")
-"""Who records in a process of its own, which no condition is evaluated in."""
+"""Roles that record in a process of their own, which no condition is evaluated in."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

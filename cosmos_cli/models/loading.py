@@ -72,15 +72,15 @@ class ScenarioFile:
     labels: AgentLabels = NO_LABELS
     """Second names of the agents."""
     place_uses: tuple[PlaceUse, ...] = ()
-    """What each agent takes of its machine for itself."""
+    """Places of its machine that each agent takes for itself."""
     timeline: ResolvedTimeline = NO_TIMELINE
     """Its timeline among these agents and actions."""
     expectations: tuple[Expectation, ...] = ()
-    """What its checks expect of these agents and streams."""
+    """Expectations of its checks, of these agents and streams."""
     placeholders: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Words that the simulation replaces itself, by field."""
     remarks: tuple[Fault, ...] = ()
-    """What the simulation finds odd in its parameters, and no fault."""
+    """Remarks of the simulation on what is odd in its parameters, and no fault."""
 
     @property
     def text(self) -> str:

@@ -12,7 +12,7 @@ from madns_runtime.plugin.api import DeclaredStream, DeviceUse, PlaceUse
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterAnswers:
-    """What follows from one set of parameters."""
+    """Consequences of one set of parameters."""
 
     agents: tuple[str, ...] = ()
     """For which it holds; empty for all others."""

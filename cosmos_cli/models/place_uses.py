@@ -1,4 +1,4 @@
-"""What several agents would take of one machine, although only one of them can have it. Pure."""
+"""Places of one machine that several agents would take, although only one of them can have it. Pure."""
 
 from __future__ import annotations
 

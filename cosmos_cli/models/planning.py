@@ -1,5 +1,5 @@
 """
-What `cosmos plan` is told instead of asking: section `plan` of a scenario. Pure.
+Section `plan` of a scenario: figures that `cosmos plan` is given instead of asking for them. Pure.
 
 A run ignores it. With it a simulation that does not exist yet can be planned, or the figures of a paper be typed in.
 """
@@ -94,7 +94,7 @@ class Planning:
 
     @property
     def missing(self) -> list[str]:
-        """What would still have to be given for a simulation that has no demand of its own."""
+        """Return what would still have to be given for a simulation that has no demand of its own."""
         return [name for name in (*REQUIRED, "flows") if getattr(self, name) is None]
 
     def applied_to(self, demand: Demand | None) -> Demand:

@@ -78,7 +78,7 @@ class PluginAnswers:
     device_uses: tuple[DeviceUse, ...] = ()
     """Channels of devices that the parameters name; empty if nobody could be asked."""
     place_uses: tuple[PlaceUse, ...] = ()
-    """What each agent takes of its machine for itself; empty if nobody could be asked."""
+    """Places of its machine that each agent takes for itself; empty if nobody could be asked."""
     placeholders: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Words that it replaces itself, by field."""
     actions: ActionAnswers = FRAMEWORK_ONLY
@@ -86,7 +86,7 @@ class PluginAnswers:
     omitted: int = 0
     """Number of further faults."""
     remarks: tuple[Fault, ...] = ()
-    """What its check finds odd, and no fault."""
+    """Remarks of its check on what is odd, and no fault."""
 
 
 def ask_plugin(

@@ -1,4 +1,4 @@
-"""What results of a scenario, value by value, and where each came from: a file and line, --set, or a default."""
+"""Values that result of a scenario, and where each came from: a file and line, --set, or a default."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class Scenario(BaseModel):
     placement: tuple[PlacementRule, ...] = ()
     """Machines of agents, rule by rule; the rest is spread evenly over all."""
     timeline: Annotated[tuple[dict[str, Any], ...], Field(max_length=ENTRIES_MAX)] = ()
-    """What is to happen in the run, and when: actions of the framework, faults, and those that the simulation declares."""
+    """Events of the run, and when each is to happen: actions of the framework, faults, and those that the simulation declares."""
     checks: Annotated[tuple[CheckRule, ...], Field(max_length=CHECKS_MAX)] = ()
     """Expectations of the recorded values, judged after the run beside the framework's own checks."""
     plan: Planning = Planning()

@@ -41,7 +41,7 @@ class ResolvedTimeline:
     entries: tuple[ScheduledEntry, ...] = ()
     faults: tuple[Fault, ...] = ()
     conditions: tuple[Condition, ...] = ()
-    """What entries wait for; their numbers are places here."""
+    """Conditions that entries wait for; their numbers are places here."""
     actions: tuple[KnownAction, ...] = ()
     """All that may be named in it."""
 

@@ -44,7 +44,7 @@ class KnownAction:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionAnswers:
-    """What is known of actions and of an entry's parameters."""
+    """Knowledge of actions and of an entry's parameters."""
 
     known: tuple[KnownAction, ...]
     is_complete: bool

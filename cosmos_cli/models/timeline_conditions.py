@@ -1,4 +1,4 @@
-"""What an entry of a timeline waits for, among the streams and agents of its run. Pure."""
+"""Conditions that entries of a timeline wait for, among the streams and agents of their run. Pure."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ RuleFault = tuple[tuple[str | int, ...], str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimelineRule:
-    """What is to happen, and when. Further keys are the action's own parameters."""
+    """One entry: an action, and when it is to happen. Further keys are the action's own parameters."""
 
     __pydantic_config__ = FORBID_EXTRA
 

@@ -1,4 +1,4 @@
-"""What a scenario says of a recorded value: which stream and field, and the bounds of it. Shared by checks and timeline."""
+"""A scenario's rules of a recorded value: which stream and field, and the bounds of it. Shared by checks and timeline."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class FieldRule(BoundsRule):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AwaitedRule(FieldRule):
-    """What is waited for in the records of some agents."""
+    """Condition that is waited for in the records of some agents."""
 
     agents: tuple[NonBlank, ...] = ()
     """Names, labels or globs of agents; host for the host's half. Not given: all who record it."""

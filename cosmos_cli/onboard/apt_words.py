@@ -175,7 +175,7 @@ _DETAILS: Mapping[str, Callable[[str], str]] = {
     "unknown": _unknown_names,
     "no_way": _source,
 }
-"""What the output says beyond the text of a trouble."""
+"""By trouble: returns its details from the output."""
 
 
 def planned_changes(output: str) -> Changes:

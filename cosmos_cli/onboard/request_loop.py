@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     Handler = Callable[["VerbRequest"], Any]
 
 PlainValue: TypeAlias = "Any"
-"""What JSON can hold; for the modules that are sent, which import no typing either."""
+"""A value that JSON can hold; for the modules that are sent, which import no typing either."""
 
 BOOT_ID_FILE = "/proc/sys/kernel/random/boot_id"
 HEADER_BYTES_MAX = 64 * 1024 * 1024

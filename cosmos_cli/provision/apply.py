@@ -102,7 +102,7 @@ _CHANGES: Mapping[str, Callable[[Any], Any]] = {
     "service": lambda value: True,
     "set_values": lambda value: True,
 }
-"""What tells of a change in the answer of a verb; of others it is the answer itself."""
+"""Whether the answer of a verb tells of a change; of other verbs the answer itself does."""
 
 
 def _has_changed(verb: str, value: Any) -> bool:

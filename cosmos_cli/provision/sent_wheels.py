@@ -44,9 +44,9 @@ from madns_runtime.bounded_files import read_regular_file
 RULE = 1
 """Of what is left out and added; another one makes other wheels."""
 RUNTIME_NAMES = ("annotated-types", "msgpack", "numpy", "orjson", "psutil")
-"""What the runtime requires. Of other wheels nothing is left out: a scenario may import their tests."""
+"""Distributions that the runtime requires. Of other wheels nothing is left out: a scenario may import their tests."""
 LEFT_OUT_FOLDERS = ("numpy/distutils/", "numpy/f2py/", "numpy/_pyinstaller/")
-"""What serves who compiles or packages, and is imported by nothing else."""
+"""Files for those who compile or package, which nothing else imports."""
 TESTS = "tests"
 LEFT_OUT_SUFFIXES = (".pyi", ".pxd", ".pyx", ".c", ".h", ".a")
 """Stubs, and what a compiler reads."""

@@ -1,4 +1,4 @@
-"""What a run's timeline did, in its report: a table of the actions, and a band for each in figures over simulated time."""
+"""A run's timeline in its report: a table of the actions, and a band for each in figures over simulated time."""
 
 from __future__ import annotations
 

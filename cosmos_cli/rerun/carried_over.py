@@ -1,5 +1,5 @@
 """
-What a recorded run's scenario says of its checks and its timeline, as a rerun in lockstep can have it.
+Checks and timeline of a recorded run's scenario, as a rerun in lockstep can have them.
 
 Taken from scenario.yaml in the run's directory. What does not fit is named: faults of devices are in the samples that are
 played back, and a run in real time that ended early ends again with the tick that was its last.

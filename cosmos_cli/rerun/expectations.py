@@ -1,4 +1,4 @@
-"""What a scenario's checks came to in the recorded run and in its rerun."""
+"""Outcomes of a scenario's checks in the recorded run and in its rerun."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ExpectationComparison:
 
     @property
     def words(self) -> str:
-        """What it came to, for a person."""
+        """Return its outcome in words."""
         before = _came_to(self.got, self.unit, is_held=self.passed)
         after = _came_to(self.rerun_got, self.unit, is_held=self.rerun_passed)
         return f"check {self.name}: {before} on record, {after} in the rerun ({self.expected})"

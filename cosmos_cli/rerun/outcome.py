@@ -1,4 +1,4 @@
-"""What a rerun came to, for a person and as JSON. Pure."""
+"""Outcome of a rerun, in words and as JSON. Pure."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class RecordedAgent:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownRun:
-    """What a rerun is made of."""
+    """A recorded run, as far as a rerun is made of it."""
 
     run: RunDirectory
     config: RunConfig

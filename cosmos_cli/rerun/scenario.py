@@ -37,7 +37,7 @@ RATE_ROWS_MAX: Final = 1000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RerunScenario:
-    """What is flown, and what is not as it was."""
+    """A scenario that is flown again, and what is not as it was."""
 
     scenario: ScenarioFile
     remarks: tuple[str, ...]

@@ -24,7 +24,7 @@ END_SHARE: Final = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaseSettings:
-    """What the command line changes in every test."""
+    """Changes that the command line makes in every test."""
 
     overrides: tuple[str, ...] = ()
     """KEY=VALUE of --set."""

@@ -33,7 +33,7 @@ class CaseOutcome:
     broken: tuple[str, ...] = ()
     """One line per broken check."""
     words: str = ""
-    """What the run said last, where it came to no verdict."""
+    """Last words of the run, where it came to no verdict."""
     directory: str = ""
     """Kept evidence; empty where none is kept."""
     figures: tuple[ComparedFigure, ...] = ()

@@ -45,7 +45,7 @@ class SuiteOptions:
 
 @dataclass(slots=True, kw_only=True)
 class SuiteResult:
-    """What came of a suite."""
+    """Outcome of a suite."""
 
     outcomes: list[CaseOutcome] = field(default_factory=list)
     not_run: int = 0

@@ -99,7 +99,7 @@ def _sum(first: float, second: float) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Condition:
-    """What is waited for in one field of one stream, of each of some agents."""
+    """Values that are waited for in one field of one stream, of each of some agents."""
 
     number: int
     """Its own in the run, by which messages and callers name it."""

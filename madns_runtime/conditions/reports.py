@@ -20,7 +20,7 @@ class MetCondition:
 
     condition: Condition
     agent: str
-    """Whose record it was: an agent's name, or `host`."""
+    """Source of the record: an agent's name, or `host`."""
     t_s: float
     """Simulated time of it, s."""
     heard_s: float

@@ -33,7 +33,7 @@ class LateMessage(NamedTuple):
 
 
 class LateMessages:
-    """What is held back: BEST messages may overtake each other, the others keep the order of their class."""
+    """Messages that are held back: BEST messages may overtake each other, the others keep the order of their class."""
 
     def __init__(self) -> None:
         self._heap: list[tuple[float, int, LateMessage]] = []

@@ -1,5 +1,5 @@
 """
-What becomes of a message under the faults in force: decided by rules, by chance under the seed. Pure.
+Fates of messages under the faults in force: decided by rules, by chance under the seed. Pure.
 
 Chance is drawn for names and numbers, not in turn: which fault, whose message, in which direction, and its number since
 the fault began. The same messages have the same fate in real time, in lockstep, and in whatever order the host knows of them.
@@ -56,7 +56,7 @@ class MessageRule:
 
 @dataclass(slots=True)
 class Fate:
-    """What becomes of one message."""
+    """Fate of one message."""
 
     is_lost: bool = False
     late_s: float = 0.0

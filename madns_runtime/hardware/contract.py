@@ -58,7 +58,7 @@ class Channel:
     safe: float | tuple[float, ...] | None = None
     """Value of an output in which it harms nobody; None if only `Device.make_safe` knows it."""
     underrun: Literal["hold", "safe"] = "hold"
-    """What an output does whose profile has run out: it holds the newest value, or takes the safe one."""
+    """Value of an output whose profile has run out: hold keeps the newest one, safe takes the safe one."""
 
     @property
     def size(self) -> int:
@@ -138,7 +138,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Needs:
-    """What a machine needs so that a device works; `cosmos up` installs it, `cosmos doctor` looks for it."""
+    """Needs of a device that its machine has to meet; `cosmos up` installs them, `cosmos doctor` looks for them."""
 
     packages: tuple[str, ...] = ()
     """Packages of the system, by Debian's names."""
@@ -230,9 +230,9 @@ class DeviceKind:
 
     name: str
     summary: str
-    """What it is, in one line."""
+    """Description, in one line."""
     channels: tuple[Channel, ...] | Callable[[Any], tuple[Channel, ...]]
-    """What it measures and takes, or a function of the parameters that tells."""
+    """Channels that it measures and takes, or a function of the parameters that tells."""
     device: str | type[Device] = ""
     """The class: module:Class, :Class in the descriptor's own file, or the class itself; a class that bears the kind
     as its `kind` is meant where nothing is said."""

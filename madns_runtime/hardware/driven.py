@@ -152,7 +152,7 @@ class DeviceProcess:
     started_s: float = 0.0
     killed_why: str = ""
     gave_up_why: str = ""
-    """What it told itself before its end."""
+    """Its own words before its end."""
 
     def has_words(self) -> bool:
         """Tell whether it has said something that nobody has heard, or has closed its end."""

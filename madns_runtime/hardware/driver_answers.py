@@ -1,4 +1,4 @@
-"""What a driver's methods return beside samples, looked at before it is used, and what they raise, in words."""
+"""Values that a driver's methods return beside samples, looked at before they are used, and what they raise, in words."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ _TIMEGPS: Final = Struct("<IihbBI")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ToldQuality:
-    """What a receiver says of itself, which truth does not tell."""
+    """Quality of a fix as a receiver states it, which truth does not tell."""
 
     position_m: float
     """Accuracy of position, one standard deviation, m."""

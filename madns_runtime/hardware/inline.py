@@ -63,9 +63,9 @@ class InlineDevice:
         self._count = 0
         self._launch = launch
         self._why = ""
-        """What its driver raised at the end, or why it was lost before."""
+        """Words for what its driver raised at the end, or why it was lost before."""
         self._failure: PluginError | None = None
-        """What it raised while its agent took no step."""
+        """Error of its driver while its agent took no step."""
         self._handed_s = 0.0
         """When agents handed over what is heard next, simulated, s."""
         self._own_end, other_end = messages.make_pair()

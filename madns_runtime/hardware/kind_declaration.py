@@ -1,4 +1,4 @@
-"""What a kind of device declares, looked at before it is believed: its writer made it by hand. Pure."""
+"""Declarations of kinds of devices, looked at before they are believed: their writers made them by hand. Pure."""
 
 from __future__ import annotations
 

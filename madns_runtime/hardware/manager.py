@@ -41,7 +41,7 @@ LOOK_PERIOD_S: Final = 0.05
 """Between two looks at the devices' pages."""
 STALL_S: Final = 1.0
 STALL_GRACE_S: Final = 0.5
-"""Who looks so late stood still itself, and so may have the devices: they are given a grace, once."""
+"""Delay of a look after which this process stood still itself, and so may have the devices: they are given a grace, once."""
 OPENING_S: Final = 5.0
 """How long agents wait for devices to be opened, once, before they are started themselves."""
 OPENING_POLL_S: Final = 0.005

@@ -24,7 +24,7 @@ SOCKET_NAME: Final = ".orders.sock"
 LINE_BYTES_MAX: Final = 65_536
 """Of an order: the longest text that an action takes fits in several times."""
 VISITORS_MAX: Final = 8
-"""Who knocks beyond them closes the door behind the one that has waited longest."""
+"""Each visitor beyond them closes the door behind the one that has waited longest."""
 
 Fault = tuple[str, str, float | None]
 """Target, action and value."""

@@ -1,4 +1,4 @@
-"""What a device's process sends to the agents that use it: in order, and behind what waits for room."""
+"""Messages of a device's process to the agents that use it: in order, and behind what waits for room."""
 
 from __future__ import annotations
 

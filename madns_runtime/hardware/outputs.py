@@ -1,5 +1,5 @@
 """
-What a device is to put out: what agents hand over, refused or kept until it is due. Pure: times go in.
+Outputs of a device: what agents hand over, refused or kept until it is due. Pure: times go in.
 
 Writes are due on the clock of whoever drives the device, points of profiles at simulated times.
 """
@@ -31,7 +31,7 @@ class DueOutput:
 
     channel: Channel
     value: Any
-    """What the driver is given."""
+    """Value that the driver is given."""
     due_s: float
     """On the clock of whoever drives the device, s."""
     point: ProfilePoint | None = None

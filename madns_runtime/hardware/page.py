@@ -76,7 +76,7 @@ class DevicePage:
         self.loss = TextSlot(view[HEADER_BYTES : HEADER_BYTES + SLOT_BYTES])
         """Why it was lost the last time; the manager writes it."""
         self.counts = CountTable(view[HEADER_BYTES + SLOT_BYTES : time_start])
-        """What its process counts; it outlives that."""
+        """Counts of its process; they outlive it."""
         self.time = TimeSlot(view, time_start)
         self._frames: dict[str, memoryview[int]] = {}
         for channel, start in places:

@@ -26,7 +26,7 @@ class PendingWrite:
 
 
 class PendingWrites:
-    """What waits, of all outputs of a device."""
+    """Values that wait, of all outputs of a device."""
 
     def __init__(self) -> None:
         self._heap: list[PendingWrite] = []

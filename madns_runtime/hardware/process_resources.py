@@ -1,4 +1,4 @@
-"""What a device's driver may use up: descriptors and memory of its process."""
+"""Resources that a device's driver may use up: descriptors and memory of its process."""
 
 from __future__ import annotations
 

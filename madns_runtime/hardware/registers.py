@@ -64,7 +64,7 @@ class RegisterWrite:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisterMap:
-    """What the device's data sheet says, as far as it is used."""
+    """Figures of the device's data sheet, as far as they are used."""
 
     registers: Annotated[tuple[Register, ...], MinLen(1)]
     setup: tuple[RegisterWrite, ...] = ()

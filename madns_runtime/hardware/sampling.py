@@ -38,7 +38,7 @@ ORDER_BYTES_MAX: Final = 4 * 1024 * 1024
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SamplingOrder:
-    """What to drive, how long, and where it is recorded."""
+    """A device to drive, how long, and where it is recorded."""
 
     devices: tuple[DeviceLaunch, ...]
     seconds: Annotated[float, Gt(0), Le(3600)]

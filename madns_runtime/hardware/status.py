@@ -65,7 +65,7 @@ def back_off_s(failures: int) -> float:
 
 @dataclass(slots=True)
 class StatusAccount:
-    """What a device's statuses came to over a run: what its checks are judged by."""
+    """Summary of a device's statuses over a run, by which its checks are judged."""
 
     status: DeviceStatus = "never"
     since_s: float = 0.0

@@ -18,7 +18,7 @@ from typing import Final
 from madns_runtime.health.stress import NUMBER_BITS, factorise
 
 END_TIMEOUT_S: Final = 1.0
-"""Who does not end by then is killed."""
+"""Time after which one that has not ended is killed, s."""
 
 
 def start_stress_processes(workers: int) -> tuple[subprocess.Popen[bytes], ...]:

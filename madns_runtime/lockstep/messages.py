@@ -126,7 +126,7 @@ class Outbox:
         """One per worker: the receiver, by index, and the body."""
         self._box_of = [self.boxes[number] for number, share in enumerate(shares) for _ in share]
         self.faults: MessageFaults | None = None
-        """Who is shown what the host's half sends, while faults are in force."""
+        """Sees what the host's half sends, while faults are in force."""
         self._index = {name: number for number, name in enumerate(account.names)}
         self._allowances = [Allowance() for _ in account.names]
         self._account = account

@@ -67,7 +67,7 @@ class Carrier:
     ) -> None:
         self.medium: Medium | None = None
         self.faults: WayFaults | None = None
-        """What becomes of messages beyond what the medium says, while faults are in force."""
+        """Fates of messages beyond what the medium says, while faults are in force."""
         self._agents = frozenset(agents)
         self._post = post
         self._now_s = now_s

@@ -1,4 +1,4 @@
-"""What is wrong with what the functions of a simulation's descriptor return, in words. Pure."""
+"""Faults in what the functions of a simulation's descriptor return, in words. Pure."""
 
 from __future__ import annotations
 

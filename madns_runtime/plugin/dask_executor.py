@@ -68,7 +68,7 @@ class DaskExecutor(Executor):
     """
 
     packs_at_once = True
-    """What a job is given is packed while `submit` runs; Dask itself would do it later."""
+    """Arguments of a job are packed while `submit` runs; Dask itself would do it later."""
 
     def __init__(
         self,

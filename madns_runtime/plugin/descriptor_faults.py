@@ -1,4 +1,4 @@
-"""What is wrong with a simulation's descriptor itself, before any part of it is imported, in words. Pure."""
+"""Faults in a simulation's descriptor itself, before any part of it is imported, in words. Pure."""
 
 from __future__ import annotations
 

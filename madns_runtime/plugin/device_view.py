@@ -36,7 +36,7 @@ class ChannelFrame(NamedTuple):
 
 
 class ChannelForm(NamedTuple):
-    """What a channel's values are."""
+    """Description of a channel's values."""
 
     unit: str
     """As its kind declares it, such as rad/s; empty if it does not."""

@@ -42,7 +42,7 @@ CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
 """Checks of what methods return, by method; values of other methods are not looked at."""
 ACTION_METHODS: Final = ("begin_action", "end_action")
 STAND_S: Final = 1e-6
-"""Who asks for times that are nearer to each other lets simulated time stand."""
+"""A half that asks for times nearer to each other lets simulated time stand."""
 REPEATS_MAX: Final = 100_000
 """Calls of the timer, or jobs, at one simulated time; more means that the half never lets time go on."""
 READY_SHARE = 0.8
@@ -69,7 +69,7 @@ class RoleProgram:
     columns: tuple[str, ...] = ()
     """Fields whose newest values are told."""
     actions: tuple[ActionKind, ...] = ()
-    """What the simulation declares for timelines."""
+    """Actions that the simulation declares for timelines."""
     life: int = 1
     """Number of this process of an agent."""
     agent_parameters: Mapping[str, Any] = field(default_factory=dict)

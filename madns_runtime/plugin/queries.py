@@ -40,7 +40,7 @@ from madns_runtime.plugin.registry import load_function
 OF_SCENARIOS = ("check", "check_actions", "streams", "labels", "device_uses", "place_uses")
 """Parts of a descriptor that a scenario is read with."""
 CHECK_MORE = ("names", "duration_s", "is_lockstep", "tick_hz")
-"""What a `check` may take beside parameters, count of agents and folder."""
+"""Arguments that a `check` may take beside parameters, count of agents and folder."""
 Use = TypeVar("Use", DeviceUse, PlaceUse)
 
 

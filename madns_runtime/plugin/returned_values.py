@@ -1,4 +1,4 @@
-"""What a simulation's functions and halves return, as values: checks, demands, declared streams, used channels, tabulated rows."""
+"""Values that a simulation's functions and halves return: checks, demands, declared streams, used channels, tabulated rows."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class DeviceUse:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceUse:
-    """What an agent's half takes of its machine for itself alone by the scenario's parameters: checked before a run."""
+    """Place of its machine that an agent's half takes for itself alone by the scenario's parameters: checked before a run."""
 
     agent: str
     field: str
@@ -126,7 +126,7 @@ class Rerun:
     parameters: Any
     """An instance of the descriptor's parameters class."""
     remarks: tuple[str, ...] = ()
-    """What is flown otherwise than it was, such as software that cannot be stepped, each a sentence."""
+    """Sentences on what is flown otherwise than it was, such as software that cannot be stepped."""
     unlike: tuple[str, ...] = ()
     """Streams, their fields as stream.field, or outputs as device.NAME.CHANNEL (globs), that depend on computers and
     networks: of a run in real time lockstep has them otherwise, or not at all. They are told and not judged."""

@@ -1,4 +1,4 @@
-"""What the host waits for in each of its states, and how long: every wait has a deadline and names whom it is for."""
+"""Waits of the host in each of its states, and how long they may be: every wait has a deadline and names whom it is for."""
 
 from __future__ import annotations
 

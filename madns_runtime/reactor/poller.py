@@ -26,7 +26,7 @@ REPEAT_LATER_S = 3e-6
 REPEAT_LATER_S_MAX = 8e-6
 """... and is set anew for one that it would miss by more, or that it would come before."""
 COUNT_BYTES = 8
-"""What a timerfd gives to read: how often it has fired."""
+"""Form of what a timerfd gives to read: how often it has fired."""
 
 
 class Poller(Protocol):

@@ -88,7 +88,7 @@ class AgentPort:
             report=self._condition_met,
             counted=counted,
         )
-        """What is waited for in this agent's records."""
+        """Conditions that are waited for in this agent's records."""
         self.t0_host_s: float | None = None
         """Simulated time zero on the host's clock; None before it is known."""
         self._rejoined_at_s: float | None = None

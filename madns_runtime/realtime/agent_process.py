@@ -67,7 +67,7 @@ class AgentProcess:
         self._packs: dict[str, Pack] = {}
         self._lives: dict[str, int] = {}
         self._counted: dict[str, dict[int, int]] = {}
-        """What conditions have counted of an agent: one that returns would read that in its records, while others wait."""
+        """Counts of an agent's conditions: one that returns would read that in its records, while others wait."""
         self._is_ending = False
         self._grant: dict[str, Any] = {}
 

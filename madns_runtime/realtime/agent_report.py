@@ -37,7 +37,7 @@ class AgentReport:
     devices: Hardware
     """Devices that no operator hears of: the host hears of them by pings."""
     scheduling: Mapping[str, Any] = field(default_factory=dict)
-    """What the kernel granted to the loop."""
+    """Scheduling that the kernel granted to the loop."""
 
     def ping(self) -> Mapping[str, Any]:
         """Return what a ping tells of the agent."""

@@ -1,4 +1,4 @@
-"""What the host of a run in real time tells its operator, and notes in its own records."""
+"""Events that the host of a run in real time tells its operator, and notes in its own records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an agent's devices are told of simulated time: how it runs on this machine's clock, by the agent's estimate."""
+"""Simulated time for an agent's devices: how it runs on this machine's clock, by the agent's estimate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from madns_runtime.hardware.port import Hardware
 from madns_runtime.realtime.agent_link import AgentPort
 
 ERROR_S_MAX = 10e-6
-"""What was told holds until the estimate has moved away from it by more, s."""
+"""Error of what was told before that is let stand, s; beyond it simulated time is told anew."""
 RATE_SPAN_S = 0.1
 
 

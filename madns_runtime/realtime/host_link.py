@@ -67,7 +67,7 @@ class HostPort:
         self.t0_s: float | None = None
         """Simulated time zero on this machine's monotonic clock; None before it is set."""
         self.faults: MessageFaults | None = None
-        """Who is shown what the host's half sends, while faults are in force."""
+        """Sees what the host's half sends, while faults are in force."""
         self.must_pump = False
         """Whether something waits to be sent or carried out."""
         self._kept_for: Address | None = None

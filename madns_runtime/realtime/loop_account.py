@@ -1,4 +1,4 @@
-"""What the loop of an agent process did with its time, so that each late tick has a cause that was measured."""
+"""Account of how the loop of an agent process spent its time, so that each late tick has a cause that was measured."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SPANS_PER_AGENT = 8
 STOLEN_INTERVAL_S = 0.02
 """The kernel counts what was stolen in steps of 10 ms, and is not asked more often, however many ticks are late."""
 WAITED_INTERVAL_S = 0.001
-"""What the loop waited for a processor is counted in nanoseconds and read more quickly."""
+"""Time that the loop waited for a processor is counted in nanoseconds and read more quickly."""
 WAITED_EVERY_S = 0.02
 STOLEN_EVERY_S = 0.1
 """How often they are read at least, where something is ever stolen: what they grew by long before is no late tick's."""
@@ -72,7 +72,7 @@ NO_STEPS = _Steps(0.0, 0.0)
 
 
 class _Looked(NamedTuple):
-    """What was at work between a deadline, of one agent or of some that are due together, and a begin."""
+    """Causes at work between a deadline, of one agent or of some that are due together, and a begin."""
 
     due_s: float
     began_s: float
@@ -90,7 +90,7 @@ class _Looked(NamedTuple):
 
 
 class _Mark(NamedTuple):
-    """What the loop's time had gone into at a moment, s."""
+    """Uses of the loop's time until a moment, s."""
 
     at_s: float
     computed_s: float
@@ -126,7 +126,7 @@ class LoopAccount:
         self._collection_began_s = math.nan
         self._marks = deque([_Mark.now(reactor)], maxlen=MARKS_KEPT)
         self._looked: _Looked | None = None
-        """What the newest late tick of those begun together has met."""
+        """Causes that the newest late tick of those begun together has met."""
         self._files = KernelFile.of_stolen_time(), KernelFile.of_waiting()
         self._stolen = KernelCount(self._files[0], STOLEN_INTERVAL_S)
         self._waited = KernelCount(self._files[1], WAITED_INTERVAL_S)

@@ -1,4 +1,4 @@
-"""What the operator orders in the midst of a run in real time, taken from its JSON lines and carried out."""
+"""Orders of the operator in the midst of a run in real time, taken from their JSON lines and carried out."""
 
 from __future__ import annotations
 

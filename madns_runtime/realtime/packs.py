@@ -59,7 +59,7 @@ class Pack:
         if process.agents == 1:
             process.after_packet = self._answered
         self._next: tuple[PackMember, float] | None = None
-        """Whose tick it wakes for, and when that is due, s of simulated time."""
+        """The member whose tick it wakes for, and when that is due, s of simulated time."""
         self._due_s = math.inf
         """When that is on the local clock, s, as the clock was after so many changes."""
         self._clock_changes = 0

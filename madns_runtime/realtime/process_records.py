@@ -41,7 +41,7 @@ class ProcessRecords:
         self.usage_due_s = math.inf
         """When to record next what the process uses, s of the local clock: in a wake-up that is for a tick anyway."""
         self.device_account: dict[str, Any] = {}
-        """What the host is told of losses between devices and the agent."""
+        """Counts for the host of losses between devices and the agent."""
 
     def clock(self, clock: ClockEstimate, now_s: float) -> None:
         """Record the estimate of the host's clock at local time *now_s*, now and then."""

@@ -26,7 +26,7 @@ SLOWED_S_MAX = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TickCalls:
-    """What an agent does in its ticks, and when something comes between."""
+    """Calls of an agent in its ticks, and when something comes between."""
 
     prepare: Callable[[float], bool] | None
     """Hands in what comes with the tick at a simulated time, s; False if the agent has ended over it. None: nothing ever does."""

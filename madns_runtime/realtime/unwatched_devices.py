@@ -26,7 +26,7 @@ TEXT_CHARACTERS_MAX: Final = 500
 class _Order:
     fault: Fault
     agent: str
-    """Who passes it on, and answers."""
+    """Passes it on, and answers."""
     until_s: float
 
 

@@ -20,7 +20,7 @@ OVERSLEPT_S = 1e-3
 
 class WakeLead:
     """
-    What most wake-ups of one loop take, learned from each.
+    Time that most wake-ups of one loop take, learned from each.
 
     It follows their upper tenth: one that was late by milliseconds says nothing of the others. On a computer that
     always takes longer than LEAD_S_MAX, that is the lead.

@@ -29,7 +29,7 @@ CLOSE_TIMEOUT_S = 10.0
 
 
 class StreamTap(Protocol):
-    """What looks at some of the streams as they are recorded."""
+    """An observer of some of the streams as they are recorded."""
 
     def open(
         self,

@@ -27,7 +27,7 @@ class ActionKind:
     word: str
     """Such as lose_messages: lower case, imperative."""
     summary: str
-    """What it does, in one sentence."""
+    """Effect, in one sentence."""
     parameters: type = NoParameters
     """A frozen stdlib dataclass; bounds are annotated_types, units stand in field names."""
     takes_agents: bool = True
@@ -59,7 +59,7 @@ class TimelineAction:
     for_s: float | None
     """How long it lasts, s; None for one that has no end, or none before the run's."""
     chance: int = 0
-    """What its chance is drawn for, beside the seed; see `runner.chance_of`."""
+    """Number that its chance is drawn for, beside the seed; see `runner.chance_of`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

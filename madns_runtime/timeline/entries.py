@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScheduledEntry:
-    """What is to happen, and one of four rules of when: at_s, every_s, rate_per_h or condition."""
+    """An action that is to happen, and one of four rules of when: at_s, every_s, rate_per_h or condition."""
 
     action: str
     """Word of the action."""

@@ -16,7 +16,7 @@ DeviceFaultWord = Literal["freeze", "bias", "noise", "drop", "delay", "disconnec
 TEXT_CHARACTERS_MAX: Final = 200
 STEP_MS_MAX: Final = 10_000
 DRIFT_PPM_MAX: Final = 500
-"""What an estimate of the host's clock follows: two crystals differ by less, and a time service slews by so much."""
+"""The most that an estimate of the host's clock follows: two crystals differ by less, and a time service slews by so much."""
 FORBID_EXTRA: Final = {"extra": "forbid"}
 ENTRY_KEYS: Final = ("action", "agents", "at_s", "every_s", "when", "rate_per_h", "from_s", "to_s", "for_s")  # fmt: skip
 """Keys of a timeline's entry itself, beside which the action's parameters stand."""
@@ -29,7 +29,7 @@ class Annotate:
     __pydantic_config__ = FORBID_EXTRA
 
     text: Annotated[str, MinLen(1), MaxLen(TEXT_CHARACTERS_MAX)]
-    """What is written beside the band."""
+    """Words beside the band."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +71,7 @@ class DeviceFault:
     device: Annotated[str, MinLen(1)]
     """The device, by the name that its agents know."""
     fault: DeviceFaultWord
-    """What happens to its samples."""
+    """Kind of the fault of its samples."""
     value: Annotated[float, Ge(-1e12), Le(1e12)] | None = None
     """Of bias and noise, in the channel's unit; of drop the share of samples, 0 to 1; of delay seconds."""
 

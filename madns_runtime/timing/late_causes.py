@@ -17,7 +17,7 @@ class Cause(StrEnum):
     """The causes, in the order of their precedence."""
 
     CLOCK = "clock"
-    """What the agent takes for the host's time leapt ahead: its clock was put wrong, or its estimate was far off."""
+    """The agent's estimate of the host's time leapt ahead: its clock was put wrong, or its estimate was far off."""
     START = "start"
     """It is the agent's first tick, and the order to start, or what set-up left to do, came after its deadline."""
     STOLEN = "stolen"

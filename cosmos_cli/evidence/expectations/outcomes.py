@@ -1,4 +1,4 @@
-"""What an expectation came to for each agent, and of these the one that is told. Pure."""
+"""Outcomes of an expectation for each agent, and of these the one that is told. Pure."""
 
 from __future__ import annotations
 

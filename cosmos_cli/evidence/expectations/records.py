@@ -24,7 +24,7 @@ TABLE_NAMES = (
     ("machine", "machine_"),
     ("device", "device_"),
 )
-"""Who records, and what the names of their tables begin with."""
+"""Roles that record, and what the names of their tables begin with."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,7 @@ from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Sample
 
 @dataclass(frozen=True, kw_only=True)
 class DriverParameters:
-    """What inventory or scenario may set."""
+    """Parameters that inventory or scenario may set."""
 
     file: str = "/proc/loadavg"
     """Where the number is read."""

@@ -20,7 +20,7 @@ AXES: Final = ("x", "y", "z")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChannelSamples:
-    """What one channel of three numbers gave in one go."""
+    """Samples that one channel of three numbers gave in one go."""
 
     name: str
     """The channel's."""
@@ -43,7 +43,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorCalibration:
-    """What one sensor's calibration came to: a reading is alignment (scale raw - bias)."""
+    """Result of one sensor's calibration: a reading is alignment (scale raw - bias)."""
 
     sensor: SensorName
     channel: str

@@ -1,4 +1,4 @@
-"""What a CAN bus is to the driver of `can`, by whatever library it is reached."""
+"""A CAN bus as the driver of `can` sees it, by whatever library it is reached."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ class EmulatedMcu(Device):
             raise MachineError(f"{p.firmware} {fault}")
         self._poll = select.epoll()
         self._held: dict[tuple[str, int], Any] = {}
-        """What the sensors hold, by sensor and element, as far as it was told since it was asked for."""
+        """Values that the sensors hold, by sensor and element, as far as it was told since it was asked for."""
         self._is_asked = False
         self._timer = TimerFd()
         self._gathered = b""

@@ -22,7 +22,7 @@ CURES: Final = {
     errno.EBUSY: "another program has one of the lines",
     errno.EINVAL: "it has not all of these lines, or they cannot do this",
 }
-"""What to tell of lines that are refused, and what to do."""
+"""Words for lines that are refused, and what to do."""
 
 
 class GpioDevice(Device):

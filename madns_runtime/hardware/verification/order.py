@@ -1,4 +1,4 @@
-"""What is verified, and what came of it."""
+"""Orders to verify a driver, and what came of them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STEP_S_MAX: Final = 60.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VerificationOrder:
-    """What is verified, and how."""
+    """A driver to verify, and how."""
 
     kind: str
     """Registered kind, module:NAME, ./file.py:NAME, or ./file.py that holds one Device class."""
@@ -39,7 +39,7 @@ class VerificationOrder:
     sampling_s: float = 2.0
     """For so long samples are looked at."""
     steps: tuple[str, ...] = STEPS
-    """What is looked at, beside the declaration."""
+    """Parts that are looked at, beside the declaration."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -63,7 +63,7 @@ class Telecommand:
     """Parameters of telecommand."""
 
     text: Annotated[str, MinLen(1), MaxLen(TEXT_CHARACTERS_MAX)]
-    """What flight software receives."""
+    """Text that flight software receives."""
     station: Annotated[str, MinLen(1)] | None = None
     """Ground station that sends it, in its next contact with the vehicle; none for at once, whatever is in view."""
 

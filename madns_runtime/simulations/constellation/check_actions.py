@@ -68,7 +68,7 @@ def find_action_faults(
 
 @dataclass(frozen=True, slots=True)
 class _Fleet:
-    """What the scenario says of vehicles and stations."""
+    """Vehicles and stations as the scenario describes them."""
 
     parameters: ConstellationParameters
     satellites: Mapping[str, str]

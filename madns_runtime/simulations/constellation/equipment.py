@@ -128,7 +128,7 @@ class SensorDevice:
     scale: float | Triple = 1.0
     """Factor of the channel's values, or one for each of its axes."""
     bias: Triple = (0.0, 0.0, 0.0)
-    """What remains of the scaled values where there is nothing to measure, in the channel's unit."""
+    """Rest of the scaled values where there is nothing to measure, in the channel's unit."""
     model: SensorNoise | None = None
     """Model that is recorded beside it, with its errors; none for no more than truth beside it."""
 
@@ -162,7 +162,7 @@ class ClockDevice:
     scale: float = 1.0
     """Factor of the channel's values."""
     bias: float = 0.0
-    """What the scaled value is at the epoch, in the channel's unit."""
+    """Scaled value at the epoch, in the channel's unit."""
     model: SensorNoise | None = None
     """Model that is recorded beside it, with its errors."""
 

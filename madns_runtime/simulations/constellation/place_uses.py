@@ -1,5 +1,5 @@
 """
-What each vehicle's way to its flight software takes of its machine for itself: ports, sockets, serial lines.
+Places of its machine that each vehicle's way to its flight software takes for itself: ports, sockets, serial lines.
 
 As in `check`, for which it answers: nothing of it is run.
 """

@@ -29,7 +29,7 @@ Row = tuple[float, float, float]
 
 
 class SourceForm(NamedTuple):
-    """What the values of a source are."""
+    """Description of a source's values."""
 
     unit: str
     size: int

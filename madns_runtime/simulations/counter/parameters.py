@@ -33,7 +33,7 @@ DEVICE_SAMPLES = (
 )
 """One record per sample of a device that reached the host; delay: from its being taken until the host has it."""
 SAMPLE_BYTES = 256
-"""What a device's samples take in a packet, about: those of a Sense HAT with all its sensors."""
+"""Bytes that a device's samples take in a packet, about: those of a Sense HAT with all its sensors."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

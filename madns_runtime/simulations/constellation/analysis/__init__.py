@@ -1,1 +1,1 @@
-"""What a report and a comparison tell of a constellation."""
+"""Figures, tables and comparisons of a constellation."""

@@ -1,5 +1,5 @@
 """
-What is left of a change of truth whose first seconds were urgent: propagated by the executor while those are flown.
+Remainders of changes of truth whose first seconds were urgent: propagated by the executor while those are flown.
 
 The thesis lets S_sync be smaller than a batch, so that T_p(S_sync) is, too (2.5.2). Where a vehicle's whole
 future takes long to propagate, only its first seconds are propagated before its maneuver. Until the rest is there,
@@ -59,7 +59,7 @@ def split(request: VehicleRequest) -> VehicleRequest | None:
 
 @dataclass(slots=True)
 class _Remainder:
-    """What a vehicle's new future lacks."""
+    """The part that a vehicle's new future lacks."""
 
     from_s: float
     state: NDArray[np.float64]

@@ -90,7 +90,7 @@ class Cockpit:
         self._messages: list[Delivery] = []
         self._results: deque[CommandResult] = deque(maxlen=RESULTS_MAX)
         self._gauges: dict[str, tuple[float, ...]] = {}
-        """What gauges have shown since the step before, the newest of each."""
+        """Readings of gauges since the step before, the newest of each."""
         self._results_dropped = 0
         self._news: dict[str, deque[Reading]] = {}
         """Measurements since the step before."""

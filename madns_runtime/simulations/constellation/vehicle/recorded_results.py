@@ -32,7 +32,7 @@ News = TypeVar("News")
 
 
 class HeldNews(Generic[News]):
-    """What has come and waits for its tick, in the order on record."""
+    """Results that have come and wait for their tick, in the order on record."""
 
     def __init__(self) -> None:
         self._held: list[tuple[tuple[int, int], News]] = []

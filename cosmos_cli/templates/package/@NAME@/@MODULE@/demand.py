@@ -1,4 +1,4 @@
-"""What the simulation asks of host and network: `cosmos plan` holds it against the machines."""
+"""Demands of the simulation on host and network: `cosmos plan` holds them against the machines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report shows of a run beyond one line per number: values, which `cosmos report` draws."""
+"""Figures that a report shows of a run beyond one line per number: values, which `cosmos report` draws."""
 
 from __future__ import annotations
 

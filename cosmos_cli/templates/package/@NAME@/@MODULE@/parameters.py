@@ -1,4 +1,4 @@
-"""What a scenario may set."""
+"""Parameters that a scenario may set."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from @MODULE@.parameters import RoverParameters
 TRUTH = (Field("t_s", "s"), Field("agent", "", "str"), Field("position_m", "m"))
 """Where each rover is, as the host knows it."""
 DRIVE = (Field("tick", "", "int"), Field("measured_m", "m"), Field("speed_m_s", "m/s"))
-"""What a rover measured and commanded."""
+"""Measurements and commands of a rover."""
 
 
 def declared_streams(

@@ -1,5 +1,5 @@
 """
-What flight software asks for, in values that are the same for every protocol, and how that is carried out.
+Requests of flight software, in values that are the same for every protocol, and how they are carried out.
 
 Pure but for what the context does.
 """
@@ -52,7 +52,7 @@ class FlightAnswer:
     fault: str = ""
     """Why it is no answer, although it came whole; empty for none."""
     source: bytes = field(default=b"", repr=False)
-    """What was written, to be shown to whoever wrote it."""
+    """Text that was written, to be shown to its writer."""
 
 
 def carry_out(

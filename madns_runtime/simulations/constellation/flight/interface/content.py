@@ -55,7 +55,7 @@ class ContentField:
     """As in the module struct: d, Q, I, H, B, or a count before d, s or x."""
     text: str = ""
     words: tuple[str, ...] = ()
-    """What the numbers of a field stand for, from 0."""
+    """Meanings of the numbers of a field, from 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

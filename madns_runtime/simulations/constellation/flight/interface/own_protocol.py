@@ -54,7 +54,7 @@ class OwnProtocol:
 
     @property
     def faults(self) -> Mapping[str, int]:
-        """What it counts of what it could not take, as far as that is a mapping of numbers."""
+        """Return its counts of what it could not take, as far as that is a mapping of numbers."""
         told = getattr(self._protocol, "faults", {})
         known = told if isinstance(told, Mapping) else {}
         return {str(kind): int(n) for kind, n in known.items() if is_real(n) and math.isfinite(n)}

@@ -1,4 +1,4 @@
-"""What flight software is told, in values that are the same for every protocol. Pure."""
+"""Reports to flight software, in values that are the same for every protocol. Pure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from madns_runtime.simulations.constellation.messages import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetupReport:
-    """What flight software is told before the first tick."""
+    """Report to flight software before the first tick."""
 
     name: str
     satellite: str
@@ -39,7 +39,7 @@ class SetupReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TickReport:
-    """What flight software is told of one tick."""
+    """Report to flight software of one tick."""
 
     t_s: float
     readings: Mapping[str, Reading] = field(default_factory=dict)

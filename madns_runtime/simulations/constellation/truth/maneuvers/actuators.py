@@ -77,7 +77,7 @@ class Tank:
     def __init__(self, vehicle: Vehicle) -> None:
         self.mass_kg = vehicle.mass_kg
         self.propellant_kg = vehicle.thruster.propellant_kg if vehicle.thruster else 0.0
-        """What is not booked yet."""
+        """Propellant that is not booked yet."""
         self._booked: list[tuple[float, float, float]] = []
         """Begin and end of each burn that may not be over, s, and its propellant, kg."""
 

@@ -61,7 +61,7 @@ ACTUATORS = {
 FIELD_T_MAX = 7e-5
 """The Earth's field is nowhere stronger, T."""
 Given = Burn | WheelTurn | Magnetisation
-"""What an actuator makes of a command."""
+"""Effect of a command on an actuator."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

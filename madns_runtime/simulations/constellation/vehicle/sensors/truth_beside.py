@@ -1,5 +1,5 @@
 """
-What an instrument without errors, and the model of one, would have measured at the time of a device's sample.
+Values that an instrument without errors, and the model of one, would have measured at the time of a device's sample.
 
 A sample's time lies between ticks, and may lie behind the last one: truth of ticks that were served is kept for a
 while, and interpolated as between knots. An impulse between two ticks is not seen in it.
