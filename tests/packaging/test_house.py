@@ -16,6 +16,7 @@ LATE_IMPORTS_MAX = 40
 """Imports inside functions in both packages: start-up time that is worth one each."""
 FUNCTION_LINES_MAX = 70
 MODULE_LINES_MAX = 400
+PRONOUN = re.compile(r"(what|whatever|who|whoever|whom|whose)\b", re.IGNORECASE)
 FILES = sorted(
     path
     for package in PACKAGES
@@ -89,6 +90,21 @@ def functions_of(file):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             first = min(each.lineno for each in (node, *node.decorator_list))
             yield node.name, node.end_lineno - first + 1
+
+
+def texts_of(file):
+    """Yield the docstrings of a file, those below attributes and constants among them."""
+    for node in ast.walk(tree_of(file)):
+        match node:
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                yield f"{file.relative_to(ROOT)}:{node.lineno}", text.strip()
+
+
+def test_docstrings_open_with_a_noun_or_a_verb():
+    texts = dict(text for file in FILES for text in texts_of(file))
+
+    assert len(texts) > 9000
+    assert {place: text for place, text in texts.items() if PRONOUN.match(text)} == {}
 
 
 def test_functions_fit_a_screen():
