@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import os
+import resource
 import signal
 import sys
 import tempfile
@@ -162,6 +164,10 @@ def _report_unexpected(error: Exception, wants_json: bool) -> int:
         told = _plain("memory", memory_text(), int(ExitCode.MACHINES))
         return AtOnce(_report(told, memory_text(), wants_json))
 
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        text = f"{error.strerror}: `ulimit -n` is {limit}: raise it, or end programs that hold many open"
+        return _report(_plain("descriptors", text, int(ExitCode.MACHINES)), text, wants_json)
     if isinstance(error, FileNotFoundError) and _is_here_gone():
         text = "the current folder is gone: it was deleted; change to another one with cd"
         return _report(_plain(InputError.kind, text, ExitCode.BAD_INPUT), text, wants_json)
