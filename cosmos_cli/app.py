@@ -18,7 +18,7 @@ from typing import Any
 import typer
 
 from cosmos_cli.commands.command_group import USAGE_ERROR, LazyGroup
-from cosmos_cli.errors import CosmosError, ExitCode, InputError, describe
+from cosmos_cli.errors import CosmosError, ExitCode, InputError, describe, in_one_line
 from cosmos_cli.ui.console import (
     Console,
     OutputLost,
@@ -108,7 +108,7 @@ def run(arguments: list[str]) -> int:
     except (CosmosError, MadnsError) as error:
         return _report(
             describe(error),
-            str(error),
+            _with_arguments_in_one_line(str(error), arguments),
             wants_json,
             bare=bool(isinstance(error, InputError) and error.faults),
         )
@@ -147,6 +147,15 @@ def _report(description: dict[str, Any], text: str, wants_json: bool, *, bare: b
     except OSError:  # nobody is there to read it; the exit code still tells
         _leave_quietly()
     return int(description["exit_code"])
+
+
+def _with_arguments_in_one_line(text: str, arguments: Sequence[str]) -> str:
+    """Return an error without the ends of lines of what was typed: a script may hand on a name that it was given."""
+    typed = {part for argument in arguments for part in (argument, *argument.split("=", 1))}
+    for part in sorted(typed, key=len, reverse=True):
+        if "\n" in part.strip():
+            text = text.replace(part, in_one_line(part))
+    return text
 
 
 def _report_usage(error: Any, wants_json: bool) -> int:
