@@ -13,6 +13,7 @@ from ssh_harness import needs_sshd, target_of
 from sshd import Sshd
 
 from cosmos_cli.fleet import helper
+from cosmos_cli.fleet import local as local_module
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.local import LocalConnection, LocalStream
@@ -71,7 +72,8 @@ def test_signal_that_ends_it_is_told(connection, is_here):
     assert caught.value.text == f"what worked there ended early (signal {signal.SIGKILL.value})"
 
 
-def test_signal_that_ends_it_a_moment_after_its_pipe_has_closed_is_told():
+def test_signal_that_ends_it_a_moment_after_its_pipe_has_closed_is_told(monkeypatch):
+    monkeypatch.setattr(local_module, "END_TIMEOUT_S", 60.0)  # on a busy machine
     stream = LocalStream("exec 0<&-; echo ready; sleep 0.3; kill -KILL $$")
     assert stream.read(6, timeout_s=60.0) == b"ready\n"
 
