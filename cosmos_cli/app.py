@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import os
+import resource
 import signal
 import sys
 import tempfile
@@ -16,7 +18,7 @@ from typing import Any
 import typer
 
 from cosmos_cli.commands.command_group import USAGE_ERROR, LazyGroup
-from cosmos_cli.errors import CosmosError, ExitCode, InputError, describe
+from cosmos_cli.errors import CosmosError, ExitCode, InputError, describe, in_one_line
 from cosmos_cli.ui.console import (
     Console,
     OutputLost,
@@ -106,7 +108,7 @@ def run(arguments: list[str]) -> int:
     except (CosmosError, MadnsError) as error:
         return _report(
             describe(error),
-            str(error),
+            _with_arguments_in_one_line(str(error), arguments),
             wants_json,
             bare=bool(isinstance(error, InputError) and error.faults),
         )
@@ -147,6 +149,15 @@ def _report(description: dict[str, Any], text: str, wants_json: bool, *, bare: b
     return int(description["exit_code"])
 
 
+def _with_arguments_in_one_line(text: str, arguments: Sequence[str]) -> str:
+    """Return an error without the ends of lines of what was typed: a script may hand on a name that it was given."""
+    typed = {part for argument in arguments for part in (argument, *argument.split("=", 1))}
+    for part in sorted(typed, key=len, reverse=True):
+        if "\n" in part.strip():
+            text = text.replace(part, in_one_line(part))
+    return text
+
+
 def _report_usage(error: Any, wants_json: bool) -> int:
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
@@ -162,6 +173,10 @@ def _report_unexpected(error: Exception, wants_json: bool) -> int:
         told = _plain("memory", memory_text(), int(ExitCode.MACHINES))
         return AtOnce(_report(told, memory_text(), wants_json))
 
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        text = f"{error.strerror}: `ulimit -n` is {limit}: raise it, or end programs that hold many open"
+        return _report(_plain("descriptors", text, int(ExitCode.MACHINES)), text, wants_json)
     if isinstance(error, FileNotFoundError) and _is_here_gone():
         text = "the current folder is gone: it was deleted; change to another one with cd"
         return _report(_plain(InputError.kind, text, ExitCode.BAD_INPUT), text, wants_json)

@@ -61,14 +61,19 @@ class Fault:
     """KEY when the value came from --set KEY=VALUE."""
 
     def render(self) -> str:
-        """Return `file:line:col: path: text`, with the source line and a caret under it where there is one."""
-        path = "" if self.path == self.override else self.path
-        parts = [self._where(), _cut(path), _cut(self.text)]
+        """
+        Return `file:line:col: path: text`, with the source line and a caret under it where there is one.
+
+        Of what somebody wrote no line begins where a fault does: ends of lines are told, and those of a text indented.
+        """
+        path = "" if self.path == self.override else in_one_line(self.path)
+        parts = [self._where(), _cut(path), _cut(self.text).replace("\n", "\n    ")]
         head = ": ".join(part for part in parts if part)
         if not self.source or self.column is None:
             return head
         shown = self.clipped()
-        return f"{head}\n    {shown.source}\n    {' ' * (shown.caret or 0)}^"
+        source = shown.source.replace("\n", " ")
+        return f"{head}\n    {source}\n    {' ' * (shown.caret or 0)}^"
 
     def clipped(self) -> Fault:
         """Return the fault with no more of its line than is shown."""
@@ -90,9 +95,14 @@ class Fault:
 
     def _where(self) -> str:
         if self.override:
-            return f"--set {self.override}"
-        file = self.file.replace("\n", "\\n").replace("\r", "\\r")  # a fault stands on one line
+            return f"--set {in_one_line(self.override)}"
+        file = in_one_line(self.file)
         return file if self.line is None else f"{file}:{self.line}:{self.column}"
+
+
+def in_one_line(text: str) -> str:
+    r"""Return a text with its ends of lines told, as `\n`: a name that holds some must not look like two messages."""
+    return text.replace("\n", "\\n").replace("\r", "\\r")
 
 
 def _cut(text: str) -> str:

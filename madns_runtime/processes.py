@@ -9,6 +9,7 @@ library only: the operator's side sends this source to machines that have nothin
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import json
 import os
@@ -29,6 +30,10 @@ Role = Literal["operator", "host", "supervisor", "agent"]
 FILE_BYTES_MAX = 16_384
 NAME_CHARACTERS_MAX = 200
 """Of a process of many agents, whose name lists them all, so much is entered."""
+NOT_THERE = (FileNotFoundError, ProcessLookupError, PermissionError)
+"""Errors by which /proc tells that a process has ended, or that its number is another user's now, whom it may hide."""
+SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""Errors by which a file that is there cannot be read for now."""
 _FILE_NAME = re.compile(r"\.?(\d+)-(\d+)-\d+\.json")
 _serials = itertools.count()
 
@@ -102,13 +107,19 @@ def register(run: str, role: Role, name: str, run_directory: str | Path) -> Regi
         run_directory: Where the run's evidence goes.
     """
     pid = os.getpid()
+    unknown: OSError | None = None
+    start_ticks, boot_id = 0, ""
+    try:
+        start_ticks, boot_id = read_start_ticks(pid) or 0, read_boot_id()
+    except OSError as error:
+        unknown = error  # An entry without them would count as a dead process's.
     entry = ProcessEntry(
         run=run,
         role=role,
         name=_shortened(name),
         pid=pid,
-        start_ticks=read_start_ticks(pid) or 0,
-        boot_id=read_boot_id(),
+        start_ticks=start_ticks,
+        boot_id=boot_id,
         node=platform.node(),
         run_directory=str(run_directory),
         utc=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -116,6 +127,8 @@ def register(run: str, role: Role, name: str, run_directory: str | Path) -> Regi
     directory = state_directory()
     path = directory / f"{pid}-{entry.start_ticks}-{next(_serials)}.json"
     try:
+        if unknown is not None:
+            raise unknown
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         _write_whole(path, json.dumps(asdict(entry)).encode())
     except OSError as error:
@@ -128,13 +141,23 @@ def register(run: str, role: Role, name: str, run_directory: str | Path) -> Regi
 
 
 def list_processes() -> list[ProcessEntry]:
-    """Return the living processes of the register, by run, role and name; entries of dead ones are removed."""
+    """
+    Return the living processes of the register, by run, role and name; entries of dead ones are removed.
+
+    Raises:
+        OSError: It cannot be told who lives, as where descriptors or memory have run out.
+    """
     entries = [entry for path in _files() if (entry := _check(path)) is not None]
     return sorted(entries, key=lambda entry: (entry.run, entry.role, entry.name, entry.pid))
 
 
 def is_running(entry: ProcessEntry) -> bool:
-    """Return whether the entry's process lives: same pid, same start, same boot."""
+    """
+    Return whether the entry's process lives: same pid, same start, same boot.
+
+    Raises:
+        OSError: The kernel cannot be asked.
+    """
     return entry.boot_id == read_boot_id() and read_start_ticks(entry.pid) == entry.start_ticks
 
 
@@ -147,6 +170,7 @@ def end_process(entry: ProcessEntry, number: int = signal.SIGTERM) -> bool:
 
     Raises:
         PermissionError: It belongs to another user.
+        OSError: The kernel cannot be asked whether it is that one; it was not signalled.
     """
     if not hasattr(os, "pidfd_open"):
         return is_running(entry) and _signal(entry.pid, number)
@@ -154,7 +178,7 @@ def end_process(entry: ProcessEntry, number: int = signal.SIGTERM) -> bool:
         descriptor = os.pidfd_open(entry.pid)
     except ProcessLookupError:
         return False
-    except OSError:  # An old kernel or a sandbox without the call.
+    except OSError:  # An old kernel, a sandbox without the call, or no descriptor left.
         return is_running(entry) and _signal(entry.pid, number)
     try:
         # Verified after the descriptor was opened: from here on it means this process and no other.
@@ -169,10 +193,15 @@ def end_process(entry: ProcessEntry, number: int = signal.SIGTERM) -> bool:
 
 
 def read_start_ticks(pid: int) -> int | None:
-    """Return when a process started, in clock ticks since boot; None if it has ended (a zombie has)."""
+    """
+    Return when a process started, in clock ticks since boot; None if it has ended (a zombie has).
+
+    Raises:
+        OSError: The kernel cannot be asked, as where descriptors or memory have run out: the process may live.
+    """
     try:
         text = Path(f"/proc/{pid}/stat").read_bytes()
-    except OSError:
+    except NOT_THERE:
         return None
     # The name, in parentheses, may hold spaces and parentheses; state is the field after it, the third.
     values = text[text.rfind(b")") + 1 :].split()
@@ -183,17 +212,25 @@ def read_start_ticks(pid: int) -> int | None:
 
 def own_age_s() -> float:
     """Return how long ago this process started, s; 0 where the kernel does not say."""
-    ticks = read_start_ticks(os.getpid())
+    try:
+        ticks = read_start_ticks(os.getpid())
+    except OSError:
+        ticks = None
     if ticks is None:
         return 0.0
     return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK"))
 
 
 def read_boot_id() -> str:
-    """Return what names this boot of the machine; empty where the kernel does not say."""
+    """
+    Return what names this boot of the machine; empty where the kernel does not say.
+
+    Raises:
+        OSError: It cannot be asked, as where descriptors or memory have run out.
+    """
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-    except OSError:
+    except NOT_THERE:
         return ""
 
 
@@ -235,7 +272,7 @@ def _write_whole(path: Path, text: bytes) -> None:
 def _files() -> Iterator[Path]:
     try:
         paths = sorted(state_directory().iterdir())
-    except OSError:
+    except (*NOT_THERE, NotADirectoryError):
         return
     yield from (path for path in paths if _FILE_NAME.fullmatch(path.name))
 
@@ -250,7 +287,7 @@ def _check(path: Path) -> ProcessEntry | None:
         entry = None  # Not written by the process that the file is named after.
     if entry is not None and entry.node != platform.node():
         return None  # Of another machine that shares this directory: not ours to judge.
-    # One that does not see itself, out of descriptors, say, cannot tell who lives.
+    # One that does not see itself, where /proc is not mounted, cannot tell who lives.
     if read_start_ticks(os.getpid()) is None:
         return None if path.name.startswith(".") else entry
     is_dead = read_start_ticks(int(match[1])) != int(match[2])
@@ -269,7 +306,11 @@ def _read_entry(path: Path) -> ProcessEntry | None:
             if found.st_uid != os.geteuid() or not stat.S_ISREG(found.st_mode):
                 return None  # What another user wrote must not tell us whom to signal.
             values = json.loads(file.read(FILE_BYTES_MAX))
-    except (OSError, ValueError, RecursionError):
+    except (ValueError, RecursionError):
+        return None
+    except OSError as error:
+        if error.errno in SHORTAGES:
+            raise
         return None
     if not isinstance(values, dict):
         return None

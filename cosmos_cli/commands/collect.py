@@ -132,9 +132,10 @@ def _fetch(
     with retrieval:
         progress(f"asking {counted(len(retrieval.due), 'machine')}", 0.0)
         living = retrieval.find_living()
-        if living:
-            raise still_running(run.name, living)
-        return retrieval.fetch()
+        if not living:
+            return retrieval.fetch()
+    # Behind the visit, which an error would end at once: programs of this computer would be left to themselves.
+    raise still_running(run.name, living)
 
 
 def tell_outcomes(console: Console, outcomes: Sequence[Outcome[Retrieved]]) -> None:

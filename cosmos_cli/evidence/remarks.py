@@ -19,6 +19,7 @@ from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.medium.carrier import KEPT_MAX
 from madns_runtime.medium.mailbox import HELD_MAX
 from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.protocol.link_settings import LinkLimits
@@ -64,7 +65,8 @@ def mailbox_remarks(account: Mapping[str, Any]) -> tuple[str, ...]:
     if is_number(unqueued) and unqueued > 0:
         remarks.append(
             f"between agents: the queues to their receivers had no room for {counted(int(unqueued), 'message')}, as"
-            f" {QUEUE_MIB} MiB or {MESSAGES_QUEUED_MAX} messages waited in them: send less at once, or smaller ones"
+            f" {QUEUE_MIB} MiB or {MESSAGES_QUEUED_MAX} messages waited in them, or {KEPT_MAX} in all were on their way:"
+            " send less at once, or smaller ones"
         )
     return tuple(remarks)
 

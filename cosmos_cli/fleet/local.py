@@ -127,6 +127,9 @@ class LocalStream:
             wait_for(self._stdin.fileno(), select.POLLOUT, timeout_s)
             return os.write(self._stdin.fileno(), data)
         except (BrokenPipeError, ValueError):
+            # Its pipes close a moment before the kernel knows how it ended.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(END_TIMEOUT_S)
             end = self.ending()
             raise ended_early(end.errors, end.exit_status) from None
 

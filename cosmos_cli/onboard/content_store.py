@@ -17,6 +17,8 @@ from cosmos_cli.onboard.request_loop import PlainValue, sha256
 MARK = ".complete"
 HIDDEN = "."
 """First character of things half made, or on their way out; nothing else may have it."""
+NOT_SEEN = (FileNotFoundError, ProcessLookupError, PermissionError)
+"""Errors by which /proc tells that a process has ended, or is another user's."""
 
 
 def expand(path: str) -> str:
@@ -94,5 +96,6 @@ def _starts() -> Iterator[bytes]:
         if not name.isdecimal() or name == own:
             continue
         for what in ("cmdline", "environ"):
-            with contextlib.suppress(OSError), open(f"/proc/{name}/{what}", "rb") as file:
+            # Out of descriptors, say, nobody's start is known: that is an error, not nobody's use.
+            with contextlib.suppress(*NOT_SEEN), open(f"/proc/{name}/{what}", "rb") as file:
                 yield file.read()

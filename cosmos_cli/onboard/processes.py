@@ -20,6 +20,7 @@ from typing import Any, Self
 
 from cosmos_cli.onboard.request_loop import HelperRefusal, VerbRequest, no_links, verb
 from madns_runtime.processes import (
+    NOT_THERE,
     ProcessEntry,
     end_process,
     is_running,
@@ -326,7 +327,7 @@ def started_with(variable: str, value: str) -> list[int]:
     for pid in _processes():
         try:
             is_marked = mark in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-        except OSError:  # another user's, or it has just ended
+        except NOT_THERE:  # another user's, or it has just ended
             continue
         if is_marked and pid != os.getpid() and read_start_ticks(pid) is not None:
             found.append(pid)
@@ -343,7 +344,7 @@ def _writers(directory: str) -> Iterator[tuple[int, str]]:
 def _written_by(pid: int, directory: str) -> str | None:
     try:
         descriptors = os.listdir(f"/proc/{pid}/fd")
-    except OSError:  # it has ended, or is another user's
+    except NOT_THERE:  # it has ended, or is another user's
         return None
     for descriptor in descriptors:
         try:
@@ -352,7 +353,7 @@ def _written_by(pid: int, directory: str) -> str | None:
                 continue
             with open(f"/proc/{pid}/fdinfo/{descriptor}", "rb") as info:
                 flags = dict(line.split(b":", 1) for line in info if b":" in line)
-        except OSError:  # closed since
+        except NOT_THERE:  # closed since
             continue
         if int(flags.get(b"flags", b"0"), 8) & os.O_ACCMODE != os.O_RDONLY:
             return path

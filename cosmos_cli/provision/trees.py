@@ -19,12 +19,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import madns_runtime
+from cosmos_cli.cache import cache_folder
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import BUNDLE_SUFFIX, RUN_NAME
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from madns_runtime.bounded_files import read_regular_file, real_path
+from madns_runtime.processes import state_directory
 
 if TYPE_CHECKING:  # importing the scenario's model takes longer than all that is done with it here
     from cosmos_cli.models.loading import ScenarioFile
@@ -134,7 +136,7 @@ def scenario_tree(scenario_file: ScenarioFile) -> Tree:
     """
     Return the scenario's folder: what its files name, and its plug-ins with their neighbours.
 
-    Hidden files, caches, virtual environments, runs and empty folders are left out. A link to a file or
+    Hidden files, caches, virtual environments, runs, COSMoS's own state and empty folders are left out. A link to a file or
     folder within is sent as what it leads to.
 
     Raises:
@@ -316,8 +318,20 @@ def is_name_of_tree(name: str) -> bool:
 
 
 def is_folder_of_tree(path: Path) -> bool:
-    """Tell whether a folder belongs to a tree: no cache, virtual environment or run."""
-    return not (_is_run(path) or path.name in CACHE_FOLDERS or os.path.exists(path / "pyvenv.cfg"))
+    """Tell whether a folder belongs to a tree: no cache, virtual environment or run, nor what COSMoS itself keeps there."""
+    return not (
+        _is_run(path)
+        or path.name in CACHE_FOLDERS
+        or os.path.exists(path / "pyvenv.cfg")
+        or _is_own(path)
+    )
+
+
+def _is_own(path: Path) -> bool:
+    """Tell whether a folder is where this computer's state or cache is kept: it changes with every run."""
+    register = state_directory()
+    kept = (register, register.parent, cache_folder())
+    return os.path.realpath(path) in map(os.path.realpath, kept)
 
 
 def _is_run(path: Path) -> bool:

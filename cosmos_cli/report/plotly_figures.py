@@ -23,7 +23,9 @@ from cosmos_cli.report.style import (
     grid_layout,
     log_axis,
 )
+from madns_runtime.analysis.sampling import broken_at_gaps
 from madns_runtime.analysis.values import (
+    SIMULATED_TIME,
     Axis,
     Band,
     Bars,
@@ -247,6 +249,8 @@ def _drawn(mark: Mark, place: int, figure: Figure) -> list[Trace]:
 
 @_drawn.register
 def _(mark: Series, place: int, figure: Figure) -> list[Trace]:
+    if figure.x.quantity == SIMULATED_TIME.quantity:
+        mark = broken_at_gaps(mark)
     colour = _colour(mark.tone, place)
     made: Trace = {
         "type": "scatter",

@@ -118,11 +118,14 @@ class SuiteProcess:
 
     def kill(self) -> None:
         """End it and all that it started, at once."""
-        self._run = self._living_run()
+        with contextlib.suppress(
+            OSError
+        ):  # out of descriptors, say: the group is killed all the same
+            self._run = self._living_run()
         self._ending = Ending.KILLED
         signal_group(self.pid, signal.SIGKILL)
         for entry in self._run.processes if self._run else ():
-            with contextlib.suppress(PermissionError):
+            with contextlib.suppress(OSError):
                 end_process(entry, signal.SIGKILL)
 
     def _living_run(self) -> LivingRun | None:

@@ -135,6 +135,17 @@ def drawn_series(
     return replace(series, x=x, y=y)
 
 
+def broken_at_gaps(series: Series) -> Series:
+    """Return a series over time with its line broken at gaps that it shows no break at; all its samples stay."""
+    if series.form in ("points", "steps"):
+        return series
+    starts = gap_starts(series.x, len(series.x))
+    is_there = np.isfinite(series.y)
+    starts = starts[is_there[starts] & is_there[starts - 1]]
+    x, y = with_breaks(series.x, series.y, starts)
+    return replace(series, x=x, y=y) if len(starts) else series
+
+
 def evenly(count: int, points_max: int) -> NDArray[np.int64]:
     """Return indices of at most *points_max* of *count* samples, evenly spread, both ends included."""
     if count <= points_max:

@@ -62,7 +62,7 @@ SIMULATED_TIME = Axis(quantity="simulated time", unit="s")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Series:
-    """Values over an abscissa, shape (N,) each; NaN is a gap."""
+    """Values over an abscissa, shape (N,) each; NaN is a gap, as is a hole in simulated times that else come regularly."""
 
     x: Floats
     y: Floats

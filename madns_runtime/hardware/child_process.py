@@ -9,10 +9,14 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
-from time import monotonic
+from time import monotonic, sleep
+from typing import Final
 
 from madns_runtime.errors import MachineError
 from madns_runtime.hardware import messages
+
+LOOK_S: Final = 0.02
+"""Between looks whether a child has ended, where the kernel does not tell."""
 
 
 def fork_with_pair(run: Callable[[socket.socket], None]) -> tuple[int, socket.socket]:
@@ -41,22 +45,36 @@ def kill(pid: int) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
+def is_there(pid: int) -> bool:
+    """Tell whether a process of this user has that number; it may have ended and wait for its parent."""
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, PermissionError):
+        return False
+    return True
+
+
 def wait_for(pid: int, deadline_s: float) -> bool:
     """Wait until a child has ended, and return whether it has; 0 is a child that was never there."""
     if not pid:
         return True
     try:
         fd = os.pidfd_open(pid)
-    except OSError:
-        fd = -1
+    except OSError:  # ended and reaped; or there is no descriptor, and its end has to be looked for
+        while not _has_ended(pid) and monotonic() < deadline_s:
+            sleep(LOOK_S)
+        return _has_ended(pid)
     try:
-        if fd >= 0:
-            poll = select.poll()
-            poll.register(fd, select.POLLIN)
-            poll.poll(max(0.0, deadline_s - monotonic()) * 1e3)
+        poll = select.poll()
+        poll.register(fd, select.POLLIN)
+        poll.poll(max(0.0, deadline_s - monotonic()) * 1e3)
     finally:
-        if fd >= 0:
-            os.close(fd)
+        os.close(fd)
+    return _has_ended(pid)
+
+
+def _has_ended(pid: int) -> bool:
+    """Tell whether a child has ended, and let go of it; so has one that was let go of before."""
     with contextlib.suppress(ChildProcessError):
         return os.waitpid(pid, os.WNOHANG)[0] != 0
     return True

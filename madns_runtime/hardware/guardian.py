@@ -21,6 +21,7 @@ from time import monotonic
 from typing import Final
 
 from madns_runtime.hardware import messages, page
+from madns_runtime.hardware.child_process import is_there
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.reactor import Reactor
@@ -114,7 +115,10 @@ class Guardian:
         try:
             fd = os.pidfd_open(pid)
         except OSError:
-            self._reactor.call_at(0.0, then)
+            if is_there(pid):  # out of descriptors, say: it may live for long
+                self._reactor.call_at(monotonic() + RETRY_S, partial(self._watch, pid, then))
+            else:
+                self._reactor.call_at(0.0, then)
             return
 
         def ended() -> None:

@@ -97,7 +97,9 @@ class LockstepHost:
         )
         self._operator = self._meeting.operator
         calls.t_s = self._t_s
-        self._carrier = carrier = Carrier(self._names, self._outbox.post, clock.now_s)
+        self._carrier = carrier = Carrier(
+            self._names, self._outbox.post, clock.now_s, end_s=config.time.duration_s
+        )
         self._half = HostHalf(program, self._journal.say, carrier=carrier, calls=calls)
         self._guarded = LockstepHalf(
             self._half,

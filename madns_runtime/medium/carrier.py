@@ -31,7 +31,10 @@ from madns_runtime.protocol.messages import Delivery, Transmission, Transmission
 
 LEAD_S: Final = 1.0
 """Lead of the hand-over before the arrival, s: far more than a network takes."""
-
+OUTCOMES_MAX: Final = 65_536
+"""Of one message; more is a fault of the medium."""
+KEPT_MAX: Final = 2**20
+"""Messages on their way that are kept at a time; further ones are not delivered, and counted."""
 
 _MAKE: Final[dict[str, Callable[[Any], Any]]] = {"arrives_s": float, "size_bytes": int}
 """Plain kinds of an outcome's values; others are texts."""
@@ -57,6 +60,7 @@ class Carrier:
         agents: Names of all agents.
         post: Sends to an agent; returns whether it is there.
         now_s: Returns the simulated time, s.
+        end_s: Simulated time at which the run ends, s: what would be handed over later is counted and not kept.
     """
 
     def __init__(
@@ -64,6 +68,8 @@ class Carrier:
         agents: Sequence[str],
         post: Callable[[str, Delivery | TransmissionRefusal], bool],
         now_s: Callable[[], float],
+        *,
+        end_s: float = math.inf,
     ) -> None:
         self.medium: Medium | None = None
         self.faults: WayFaults | None = None
@@ -71,10 +77,11 @@ class Carrier:
         self._agents = frozenset(agents)
         self._post = post
         self._now_s = now_s
+        self._end_s = end_s
         self._accounts: dict[str, MessageAccount] = {}
         self._serial = 0
         self._untold = self._unqueued = 0
-        # Bounded by senders, their queues and the receivers: a message waits at most for its queue.
+        # At most KEPT_MAX: how long messages are on their way is the medium's to say.
         self._heap: list[tuple[float, str, int, int, str, Delivery, MessageAccount]] = []
 
     def account(self, channel: str = "") -> MessageAccount:
@@ -103,6 +110,10 @@ class Carrier:
             isinstance(outcome, LinkOutcome) for outcome in outcomes or (None,)
         ):
             raise PluginError(f"{shown(outcomes)}: expected a list of one or more LinkOutcome")
+        if len(outcomes) > OUTCOMES_MAX:
+            raise PluginError(
+                f"a list of {len(outcomes)} LinkOutcome of one message: expected at most {OUTCOMES_MAX}"
+            )
         outcomes = [_checked(outcome, transmission) for outcome in outcomes]
         if self.faults is not None:
             outcomes = self.faults.ways(sender, transmission, outcomes)
@@ -174,6 +185,13 @@ class Carrier:
         if outcome.to not in self._agents or outcome.arrives_s is None:
             return
         sent_s, arrives_s = transmission.sent_s, outcome.arrives_s
+        if arrives_s - LEAD_S > self._end_s:  # on its way for the rest of the run
+            account.in_flight += 1
+            return
+        if len(self._heap) >= KEPT_MAX:
+            account.undelivered += 1
+            self._unqueued += 1
+            return
         delivery = Delivery(sender, sent_s, arrives_s, transmission.payload)
         self._serial += 1
         account.in_flight += 1

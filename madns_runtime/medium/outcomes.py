@@ -82,7 +82,7 @@ class MessageAccount:
     in_flight: int = 0
     """Delivered, but not yet handed over."""
     undelivered: int = 0
-    """Handed over while the receiver was lost, or took no more."""
+    """Handed over while the receiver was lost, or took no more; or kept no longer, as too many were on their way."""
     heard_late: int = 0
     """Delivered ones that should have arrived before the host knew of them."""
     delivered_bytes: int = 0

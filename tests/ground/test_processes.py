@@ -1,10 +1,12 @@
 import dataclasses
+import errno
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -118,6 +120,70 @@ def test_no_entry_is_removed_by_a_process_that_cannot_see_who_lives(
 
     assert list_processes() == [entry]
     assert path.exists()
+
+
+SHORTAGES = [errno.EMFILE, errno.ENFILE, errno.ENOMEM]
+
+
+@pytest.fixture(params=SHORTAGES, ids=lambda number: errno.errorcode[number])
+def shortage(request, monkeypatch):
+    """What nobody can read while descriptors or memory have run out, by the end of its path."""
+    missed = []
+
+    def answers(function):
+        def call(path, *arguments, **settings):
+            if any(str(path).endswith(end) for end in missed):
+                raise OSError(request.param, os.strerror(request.param), str(path))
+            return function(path, *arguments, **settings)
+
+        return call
+
+    for name in ("read_bytes", "read_text", "iterdir"):
+        monkeypatch.setattr(Path, name, answers(getattr(Path, name)))
+    monkeypatch.setattr(os, "open", answers(os.open))
+    return missed
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("what", ["/stat", "/boot_id"])
+def test_process_that_cannot_be_asked_about_has_not_ended(
+    register_directory, child, shortage, what
+):
+    entry, path = enter(register_directory, pid=child.pid, start_ticks=read_start_ticks(child.pid))
+    shortage.append(f"{child.pid}{what}" if what == "/stat" else what)
+
+    for ask in (is_running, lambda entry: end_process(entry, signal.SIGKILL)):
+        with pytest.raises(OSError, match="Too many|Cannot allocate"):
+            ask(entry)
+    with pytest.raises(OSError, match="Too many|Cannot allocate"):
+        list_processes()
+    assert path.exists()
+    assert child.poll() is None
+    shortage.clear()
+    assert list_processes() == [entry]
+
+
+@pytest.mark.parametrize("what", ["state/processes", "-77.json"])
+def test_register_that_cannot_be_read_for_now_is_not_taken_for_empty(
+    register_directory, shortage, what
+):
+    entry, _ = enter(register_directory)
+    shortage.append(what)
+
+    with pytest.raises(OSError, match="Too many|Cannot allocate"):
+        list_processes()
+    shortage.clear()
+    assert list_processes() == [entry]
+
+
+def test_process_that_cannot_see_its_own_start_is_not_entered_as_a_dead_one(
+    register_directory, shortage
+):
+    shortage.append(f"/proc/{os.getpid()}/stat")
+
+    with register("r", "agent", "a-1", "/runs/1") as registration:
+        assert "cannot note process" in registration.problem
+        assert not register_directory.exists()
 
 
 @pytest.mark.process

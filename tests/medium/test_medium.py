@@ -1,11 +1,13 @@
 """Messages between agents, piece by piece: mailbox, carrier, and the medium made of four answers."""
 
 import math
+import weakref
 
 import numpy as np
 import pytest
 
 from madns_runtime.errors import MessageTooLarge, PluginError
+from madns_runtime.medium import carrier
 from madns_runtime.medium.carrier import LEAD_S, Carrier
 from madns_runtime.medium.links import LinkMedium
 from madns_runtime.medium.mailbox import HELD_MAX, NUMBERS_PER_LIFE, Mailbox
@@ -157,12 +159,16 @@ def test_what_finds_no_room_is_counted():
 # The host's side.
 
 
+class Unlimited(dict):
+    """A payload of which can be told whether somebody holds it."""
+
+
 class Desk:
     """A carrier, its clock, and what it posted; *broken* raises for a receiver, or says that it is not there."""
 
-    def __init__(self, broken=None):
+    def __init__(self, broken=None, **settings):
         self.now_s, self.posted, self.broken = 0.0, [], broken or {}
-        self.carrier = Carrier(NAMES, self._post, lambda: self.now_s)
+        self.carrier = Carrier(NAMES, self._post, lambda: self.now_s, **settings)
 
     def _post(self, to, message):
         error = self.broken.get(to)
@@ -237,6 +243,47 @@ def test_every_message_is_accounted_whatever_becomes_of_it():
         "known_late": 0,
     }
     assert adds_up(account)
+
+
+def test_what_arrives_after_the_runs_end_is_on_its_way_and_not_kept():
+    desk = Desk(end_s=10.0)
+    payload = Unlimited()
+    kept = weakref.ref(payload)
+    outcomes = [
+        delivered("car-2", 10.0 + LEAD_S),
+        delivered("car-3", 12.0),
+        delivered("car-2", 1e9),
+    ]
+    desk.carrier.enter("car-1", Transmission("*", 0, 0.0, payload), outcomes[1:])
+    del payload
+
+    assert kept() is None
+    assert desk.carrier.next_s() is None
+    desk.enter(outcomes[0], number=1)
+    assert desk.carrier.next_s() == 10.0
+    account = desk.at(10.0).carrier.to_mapping()
+    assert (account["sent"], account["delivered"], account["in_flight"]) == (3, 1, 2)
+    assert adds_up(account)
+
+
+def test_messages_on_their_way_are_kept_up_to_a_bound(monkeypatch):
+    monkeypatch.setattr(carrier, "KEPT_MAX", 3)
+    desk = Desk().enter(*(delivered("car-2", 50.0 + number) for number in range(5)))
+
+    account = desk.carrier.to_mapping()
+    assert (account["in_flight"], account["undelivered"], account["unqueued"]) == (3, 2, 2)
+    assert adds_up(account)
+    assert len(desk.at(99.0).posted) == 3
+    assert adds_up(desk.carrier.to_mapping())
+
+
+def test_a_message_with_endless_outcomes_is_a_fault_of_the_medium(monkeypatch):
+    monkeypatch.setattr(carrier, "OUTCOMES_MAX", 3)
+
+    with pytest.raises(
+        PluginError, match="a list of 4 LinkOutcome of one message: expected at most 3"
+    ):
+        Desk().enter(*(delivered("car-2", 5.0) for _ in range(4)))
 
 
 def test_what_the_host_knows_only_after_its_arrival_is_counted():

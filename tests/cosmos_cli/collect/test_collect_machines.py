@@ -242,6 +242,22 @@ def test_run_that_still_lives_on_a_machine_is_refused_and_nothing_is_touched(spl
     assert app.run(["collect"]) == 0
 
 
+def test_a_refusal_leaves_no_helper_behind(split, capsys, monkeypatch):
+    opened = []
+    open_stream = LocalConnection.open
+    monkeypatch.setattr(
+        LocalConnection,
+        "open",
+        lambda self, command: opened.append(open_stream(self, command)) or opened[-1],
+    )
+    with split.living("pi02", "agent", "agent-02"):
+        assert app.run(["collect"]) == 2
+
+    assert "is still running on pi02" in capsys.readouterr().err
+    assert len(opened) == 2
+    assert None not in [stream._process.returncode for stream in opened]
+
+
 def test_run_that_lives_in_many_processes_is_refused_in_one_short_line(split, capsys):
     with contextlib.ExitStack() as lives:
         for number in range(3):

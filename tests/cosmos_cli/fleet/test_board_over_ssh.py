@@ -13,9 +13,10 @@ from ssh_harness import needs_sshd, target_of
 from sshd import Sshd
 
 from cosmos_cli.fleet import helper
+from cosmos_cli.fleet import local as local_module
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
-from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.local import LocalConnection, LocalStream
 from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.target import Target
 
@@ -69,6 +70,16 @@ def test_signal_that_ends_it_is_told(connection, is_here):
 
     assert caught.value.kind is FailureKind.LOST
     assert caught.value.text == f"what worked there ended early (signal {signal.SIGKILL.value})"
+
+
+def test_signal_that_ends_it_a_moment_after_its_pipe_has_closed_is_told(monkeypatch):
+    monkeypatch.setattr(local_module, "END_TIMEOUT_S", 60.0)  # on a busy machine
+    stream = LocalStream("exec 0<&-; echo ready; sleep 0.3; kill -KILL $$")
+    assert stream.read(6, timeout_s=60.0) == b"ready\n"
+
+    with pytest.raises(MachineFailure, match=r"^what worked there ended early \(signal 9\)$"):
+        stream.write(b"x", timeout_s=60.0)
+    stream.close()
 
 
 def test_unknown_verb_is_refused_and_the_next_question_answered(connection, tmp_path):

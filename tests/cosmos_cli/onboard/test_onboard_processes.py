@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 import subprocess
@@ -15,7 +16,8 @@ import pytest
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.onboard.processes import MARK, RunEnding
+from cosmos_cli.onboard import content_store
+from cosmos_cli.onboard.processes import MARK, RunEnding, find_living, started_with
 from madns_runtime.processes import ProcessEntry
 
 pytestmark = pytest.mark.process
@@ -145,3 +147,31 @@ def test_last_words_are_the_end_of_a_file(board: Helper, tmp_path: Path) -> None
 
     assert board.call("last_words", arguments).value == ["second", "third"]
     assert board.call("last_words", {**arguments, "path": "/nowhere"}).value == []
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM])
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda path: started_with(MARK, str(path)),
+        lambda path: find_living(str(path), str(path)),
+        lambda path: content_store.used([str(path)]),
+    ],
+    ids=["marked", "writers", "users of content"],
+)
+def test_processes_that_cannot_be_looked_at_for_now_are_not_taken_for_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ask: Callable[[Path], object], number: int
+) -> None:
+    def fail(path: object, *arguments: object, **settings: object) -> None:
+        raise OSError(number, os.strerror(number), str(path))
+
+    listed = os.listdir
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path))
+    monkeypatch.setattr(Path, "read_bytes", fail)
+    monkeypatch.setattr("builtins.open", fail)
+    monkeypatch.setattr(
+        os, "listdir", lambda path: fail(path) if str(path).startswith("/proc/") else listed(path)
+    )
+
+    with pytest.raises(OSError, match="Too many|Cannot allocate"):
+        ask(tmp_path)

@@ -117,6 +117,22 @@ def test_tree_holds_the_scenarios_files_and_no_more(folder):
     assert paths(the_tree(folder)) == ["data/orbits.csv", "flight.py", "small.yaml"]
 
 
+def test_what_this_computer_keeps_of_its_own_belongs_to_no_tree(folder, monkeypatch):
+    before = the_tree(folder)
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(folder / "state"))
+    monkeypatch.setenv("COSMOS_CACHE", str(folder / "data/cache"))
+    for path in ("state/processes/1-2-3.json", "state/runs/a.json", "data/cache/wheels/a.whl"):
+        (folder / path).parent.mkdir(parents=True)
+        (folder / path).write_text("x")
+
+    assert the_tree(folder).hash == before.hash
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(folder))  # no folder of its own: the register alone
+    (folder / "processes").mkdir()
+    (folder / "processes/1-2-3.json").write_text("x")
+    assert "processes/1-2-3.json" not in paths(the_tree(folder))
+    assert "state/runs/a.json" in paths(the_tree(folder))
+
+
 @pytest.mark.parametrize(
     ("name", "lacks", "belongs"),
     [

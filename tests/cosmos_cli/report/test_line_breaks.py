@@ -8,10 +8,11 @@ from harness.synthetic_run import SyntheticRun, make_config
 
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.report.build import build_sections
+from cosmos_cli.report.plotly_figures import to_plotly
 from madns_runtime.analysis.breaks import gap_starts, wrap_starts
 from madns_runtime.analysis.lines import grouped_lines
 from madns_runtime.analysis.sampling import TimeEnvelope, envelope_series
-from madns_runtime.analysis.values import Axis, Figure, Floats
+from madns_runtime.analysis.values import Axis, Figure, FigureChoice, Floats, Series
 from madns_runtime.recording.records import Field, StreamSchema
 
 ELEMENTS = StreamSchema(
@@ -155,3 +156,38 @@ def test_envelope_of_all_agents_stops_while_all_were_away() -> None:
         ((before_s, after_s),) = strokes(series.x, series.y)
         assert before_s == pytest.approx(40.0, abs=1.0)
         assert after_s == pytest.approx(60.0, abs=1.0)
+
+
+def plain(times: Floats, form: str = "line", **more: object) -> tuple[Floats, Floats]:
+    """Return what is drawn of a series that somebody's own figure has as it is."""
+    mark = Series(x=times, y=times + 1.0, form=form)  # type: ignore[arg-type]
+    made = to_plotly(Figure(title="own", choices=[FigureChoice(marks=[mark])], **more))
+    ((_, (trace,)),) = made.choices
+    return trace["x"], trace["y"]
+
+
+@pytest.mark.parametrize("form", ["line", "dotted", "joined points"])
+def test_line_of_somebodys_own_series_over_simulated_time_stops_at_a_gap(form: str) -> None:
+    x, y = plain(AWAY, form)
+
+    assert strokes(x, y) == [(39.0, 60.0)]
+    assert set(AWAY + 1.0) == set(y[np.isfinite(y)])
+
+
+@pytest.mark.parametrize("form", ["points", "steps"])
+def test_what_has_no_line_or_holds_has_no_gap(form: str) -> None:
+    assert np.array_equal(plain(AWAY, form)[0], AWAY)
+
+
+def test_line_over_anything_but_time_goes_through() -> None:
+    assert np.array_equal(plain(AWAY, x=Axis(quantity="east", unit="km"))[0], AWAY)
+
+
+def test_line_that_is_broken_already_has_no_second_break() -> None:
+    (figure,) = grouped_lines({"a": (AWAY, AWAY + 1.0)}, title="some", y=Axis(unit="m"))
+    assert isinstance(figure, Figure)
+    (mark,) = figure.choices[0].marks
+    ((_, (trace,)),) = to_plotly(figure).choices
+
+    assert np.array_equal(trace["x"], mark.x)
+    assert strokes(trace["x"], trace["y"]) == [(39.0, 60.0)]

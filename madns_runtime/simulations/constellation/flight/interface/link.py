@@ -60,7 +60,8 @@ class FlightLink:
         self._has_ended = False
         self._code: int | None = None
         """Exit code of the program."""
-        self._opened_s = monotonic()
+        self._missed_s: Callable[[], float] | None = None
+        """Time for which the software was looked for, s; None before nobody was found."""
         self.transport.open()
         if isinstance(settings, FlightProcess):
             try:
@@ -117,13 +118,22 @@ class FlightLink:
             for arrival in self._thread.take():
                 found += transport.taken(*arrival)
         transport.counts["floods"] += sum(len(one.data) for one in found) >= READ_BYTES
-        if not transport.is_ready and monotonic() - self._opened_s > self._start_s:
-            ended = self.how_it_ended()
-            raise BlamedError(
-                f"{self.who}: expected somebody at {transport.name} within {self._start_s:g} s "
-                f"(parameters.flight.interface.start_s){f', but it {ended}' if ended else ''}"
-            )
+        if not transport.is_ready:
+            self._miss()
         return found
+
+    def _miss(self) -> None:
+        """Count the time for which nobody is there; before the first look, others may have been set up."""
+        if self._missed_s is None:
+            self._missed_s = self.stopwatch()
+        elif self._missed_s() > self._start_s:
+            ended = self.how_it_ended()
+            granted = " of its own" if self.program is not None and self._is_lockstep else ""
+            raise BlamedError(
+                f"{self.who}: expected somebody at {self.transport.name} within {self._start_s:g} s{granted} "
+                f"(parameters.flight.interface.start_s), waiting for {self.transport.awaited}"
+                f"{f', but it {ended}' if ended else ''}"
+            )
 
     def write(self, packets: Sequence[bytes]) -> bool:
         """Send packets; False, and none of them, if too much waits already."""

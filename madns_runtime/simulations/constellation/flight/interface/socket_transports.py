@@ -54,6 +54,13 @@ class SocketLink(StreamTransport):
         if listens:
             self.counts["peers_refused"] = 0  # who connected while another was there
 
+    @property
+    def awaited(self) -> str:
+        """What shows that the software is there, for people."""
+        if self._listens:
+            return f"it to connect to {self.address}"
+        return f"it to take a connection at {self.address}"
+
     def open(self) -> None:
         """
         Listen, or have the address ready.
@@ -181,6 +188,11 @@ class UdpLink(Transport):
     def is_ready(self) -> bool:
         """Whether it is known where to send."""
         return self._remote is not None
+
+    @property
+    def awaited(self) -> str:
+        """What shows that the software is there, for people."""
+        return f"its first datagram at {self.address}"
 
     def open(self) -> None:
         """

@@ -57,6 +57,11 @@ class Transport(ABC):
     def is_ready(self) -> bool:
         """Whether the software is there."""
 
+    @property
+    def awaited(self) -> str:
+        """What shows that the software is there, for people."""
+        return "its first word"
+
     @abstractmethod
     def open(self) -> None:
         """
