@@ -153,6 +153,7 @@ class Evidence:
             host_lost=self._host_lost(),
             interrupted=self.interrupted,
             lost_agents=self._lost(),
+            lost_because={a: text_or_none(of.get("reason")) for a, of in self._of_agents().items()},
             is_ended_by_machine=self._is_ended_by_machine(),
             machine_problems=tuple(
                 f"{p.machine}: {p.text}"

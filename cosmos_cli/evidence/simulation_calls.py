@@ -18,6 +18,7 @@ from madns_runtime.analysis.plain import from_plain, to_plain
 from madns_runtime.analysis.values import Block
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError, PluginError
+from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.isolation import call_plugin, unfolded
 from madns_runtime.plugin.registry import is_shipped, load_function, resolve
 from madns_runtime.recording.encoding import to_plain as plain_array
@@ -117,4 +118,7 @@ def _call(config: RunConfig, part: Part, arguments: tuple[Any, ...], tell: Tell)
         return simulation.name, None
     function = load_function(where, base_directory)
     tell(f"{part}() of {config.simulation}")
-    return simulation.name, call_plugin(part, function, *arguments, finish=unfolded)
+    found = call_plugin(part, function, *arguments, finish=unfolded)
+    if found is None:
+        raise PluginError(f"{place_of(function)}: {part}() returned nothing: is there no `return`?")
+    return simulation.name, found

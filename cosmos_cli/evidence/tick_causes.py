@@ -90,7 +90,7 @@ WORDS: Final[Mapping[str, CauseWords]] = {
     ),
     ABSENT: CauseWords(
         "the agent did not run: it was lost, started late, or was not back yet",
-        "`cosmos logs` and `problems` in run.json tell why; agents.restarts_max lets it come back",
+        "`cosmos logs` tells why; agents.restarts_max lets it come back",
     ),
 }
 """Meaning and cure of every cause. docs/real-time.md holds the same words."""

@@ -97,6 +97,8 @@ class RunFacts:
     """Fate of the machine that ran the host, if it was lost."""
     interrupted: bool = False
     lost_agents: tuple[str, ...] = ()
+    lost_because: Mapping[str, str | None] = field(default_factory=dict)
+    """Why an agent was lost, by its name."""
     machine_problems: tuple[str, ...] = ()
     """One line per machine that could not be reached or failed, each starting with its name."""
     is_ended_by_machine: bool = False
@@ -305,6 +307,8 @@ def _conclude(
         return ExitCode.BUDGET_BROKEN, f"CHECK BROKEN: {_listed([blame, *told])}"
     if broken:
         text = f"CHECK BROKEN: {_listed([_told(c) for c in broken])}"
+        if facts.lost_agents:
+            text += f"; lost: {_listed([_lost(facts, name) for name in facts.lost_agents])}"
         is_of_ticks = any(check.name.startswith(OF_TICKS) for check in broken)
         hint = (
             f"; ticks late or missed: {facts.late_hint}" if is_of_ticks and facts.late_hint else ""
@@ -313,6 +317,10 @@ def _conclude(
     if facts.problems:
         return ExitCode.MACHINES, f"NOT CLEAN: {_listed(facts.problems)}"
     return ExitCode.OK, _all_hold(len(checks))
+
+
+def _lost(facts: RunFacts, agent: str) -> str:
+    return _blame(agent, facts.lost_because.get(agent))
 
 
 def _all_hold(count: int) -> str:

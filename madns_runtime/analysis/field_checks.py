@@ -21,15 +21,16 @@ NO_REALS = "cMm"
 
 def real_array(values: Any, place: str) -> NDArray[np.float64]:
     """
-    Return values as an array of floats; *place* is for the message.
+    Return values as an array of floats, those under a mask as NaN; *place* is for the message.
 
     Raises:
         ValueError: They are no real numbers; or NumPy's own, with a TypeError as well.
     """
-    array = np.asarray(values)
+    array = np.asanyarray(values)
     if array.dtype.kind in NO_REALS:
         raise ValueError(f"{place}: expected real numbers, got {array.dtype}")
-    return array.astype(np.float64, copy=False)
+    floats = array.astype(np.float64, copy=False)
+    return np.asarray(floats.filled(np.nan) if isinstance(floats, np.ma.MaskedArray) else floats)
 
 
 def hold_arrays(owner: Any, shapes: Mapping[str, int]) -> None:

@@ -36,6 +36,8 @@ FRAMEWORK = Path(__file__).parents[1]
 """Where code stands that is nobody's plug-in, but for what is shipped below simulations."""
 TEXT_CHARACTERS_MAX = 2000
 """Of what a plug-in's exception says; the whole is in the log."""
+LINE_CHARACTERS_MAX = 1500
+"""Of the first line of that: with the call and the place it is no longer than a text may be."""
 
 
 class Sender(Protocol):
@@ -213,9 +215,9 @@ def describe_exception(
     error: BaseException, doing: str, called: Callable[..., Any] | None = None
 ) -> str:
     """
-    Return one line: which call of a plug-in raised what, and in which file and line.
+    Return which call of a plug-in raised what, and in which file and line: all of it in the first line.
 
-    The place is the innermost line of the plug-in's own folder, not that of a library which it called; of what was
+    What the error says beyond its own first line follows, for verdicts show no more than one. The place is the innermost line of the plug-in's own folder, not that of a library which it called; of what was
     raised before its first line, as by arguments that it does not take, where it is written. Errors that blame the
     user's file say all by themselves.
 
@@ -237,9 +239,12 @@ def describe_exception(
         own = [frame for frame in frames[1:] if _is_below(Path(frame.filename), home)]
         frame = own[-1] if own else frames[-1]
         place = f"{Path(frame.filename).name}:{frame.lineno}"
-    said = error_text(error)
-    text = f": {clean_text(said)}" if said else ""
-    return f"{doing} raised {type(error).__name__}{text}{place and f' ({place})'}"
+    first, *rest = clean_text(error_text(error).strip()).splitlines() or [""]
+    if len(first) > LINE_CHARACTERS_MAX:
+        first = f"{first[:LINE_CHARACTERS_MAX]} [cut]"
+    text = f": {first}" if first else ""
+    line = f"{doing} raised {type(error).__name__}{text}{place and f' ({place})'}"
+    return "\n".join((line, *rest))
 
 
 def clean_text(text: str) -> str:

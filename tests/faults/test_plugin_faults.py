@@ -84,8 +84,9 @@ def test_exception_in_one_agent_is_its_loss_if_the_policy_is_to_continue(laborat
         faults={"side": "agent", "method": "step", **AT_ONCE},
     )
 
-    said = "agent-02 is lost: FaultyAgent.step raised ValueError: step is broken on purpose"
-    document = check_ending(run, 4, "complete", said, "CHECK BROKEN: agents.lost 1")
+    why = "FaultyAgent.step raised ValueError: step is broken on purpose (faulty_simulation.py:"
+    broken = f"CHECK BROKEN: agents.lost 1 (limit 0); lost: agent-02: {why}"
+    document = check_ending(run, 4, "complete", f"agent-02 is lost: {why}", broken)
     assert document["agents"]["lost"] == ["agent-02"]
 
 

@@ -114,6 +114,23 @@ def test_exception_that_cannot_say_what_it_is_is_told_all_the_same():
     assert said(OutOfReach()) == "OutOfReach: (its __str__ raised TypeError)"
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2 faults\nspeed: -1\nmark: None", "2 faults (rover.py:2)\nspeed: -1\nmark: None"),
+        ("\n  speed: -1", "speed: -1 (rover.py:2)"),
+        ("x" * 5000, f"{'x' * 1500} [cut] (rover.py:2)"),
+        (f"one\n{'x' * 5000}", f"one (rover.py:2)\n{'x' * 1996} [cut]"),
+    ],
+)
+def test_place_stands_in_the_first_line_however_much_an_exception_says(tmp_path, text, expected):
+    names: dict[str, Any] = {}
+    source = "def step(text):\n    raise RuntimeError(text)\n"
+    exec(compile(source, tmp_path / "rover.py", "exec"), names)
+
+    assert told(names["step"], text) == f"Rover.step raised RuntimeError: {expected}"
+
+
 def test_library_in_an_environment_beside_the_plugin_is_not_the_plugin(tmp_path, plugin):
     folder = tmp_path / ".venv/lib/site-packages"
     folder.mkdir(parents=True)

@@ -1,6 +1,7 @@
 import json
 import math
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from madns_runtime.config import Recording
 from madns_runtime.errors import MachineError
+from madns_runtime.lockstep.recorder import DirectWriter
 from madns_runtime.recording import reader
 from madns_runtime.recording.reader import read_columns, read_stream
 from madns_runtime.recording.record_files import RecordFiles
@@ -63,6 +65,25 @@ def test_whole_stream_is_read_back(tmp_path):
     assert reading.state == reader.StreamState(
         records=10, is_cut=False, recorded=10, t0_utc="2026-01-02T03:04:05Z"
     )
+
+
+def test_lines_that_are_no_records_are_those_of_which_the_guide_tells(tmp_path):
+    files = RecordFiles(tmp_path, run="0001-test", source="a")
+    recorder = Recorder(files, Recording(), DirectWriter(files))
+    recorder.open_stream(TICKS)
+    for row in make_ticks(2):
+        recorder.record("ticks", row)
+        recorder.flush()
+        recorder.set_t0("2026-01-02T03:04:05Z")
+    recorder.close(30)
+    guide = (Path(__file__).parents[2] / "docs/plugins.md").read_text()
+
+    lines = [json.loads(line) for line in (tmp_path / "ticks.jsonl").read_text().splitlines()]
+
+    assert [type(line) for line in lines] == [dict, list, dict, list, dict]
+    assert [[*line] for line in (lines[2], lines[4])] == [["t0_utc"], ["end"]]
+    assert '`{"t0_utc": ...}`' in guide
+    assert '`{"end": {"records": ...}}`' in guide
 
 
 def test_state_is_known_without_asking_for_the_records(tmp_path):

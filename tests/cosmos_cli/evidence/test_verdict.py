@@ -45,6 +45,23 @@ def test_nothing_wrong_is_green():
     assert verdict.text.startswith("PASSED")
 
 
+def test_verdict_on_a_run_that_went_on_without_agents_tells_why_they_were_lost():
+    why = {
+        "car-1": "Car.step raised ValueError: 2 faults (car.py:7)\nspeed",
+        **{f"car-{number}": "it said nothing for 2.5 s" for number in range(2, 5)},
+    }
+    lost = tuple(why)
+
+    assert judged(lost_agents=lost[:1], lost_because=why).text == (
+        "CHECK BROKEN: agents.lost 1 (limit 0);"
+        " lost: car-1: Car.step raised ValueError: 2 faults (car.py:7) ..."
+    )
+    assert judged(lost_agents=lost, lost_because=why).text.endswith(
+        "; car-3: it said nothing for 2.5 s; and 1 more"
+    )
+    assert judged(lost_agents=lost[:1]).text == "CHECK BROKEN: agents.lost 1 (limit 0); lost: car-1"
+
+
 @pytest.mark.parametrize(
     ("who", "reason", "text"),
     [

@@ -140,6 +140,16 @@ def test_map_has_one_scale_on_both_axes():
     assert to_plotly(EVERY[3]).layout["yaxis"]["scaleanchor"] == "x"
 
 
+def test_what_a_mask_hides_is_a_gap():
+    values = np.ma.masked_greater(np.arange(5), 2)
+    gaps = [0.0, 1.0, 2.0, np.nan, np.nan]
+
+    np.testing.assert_array_equal(Series(x=X, y=values).y, gaps)
+    np.testing.assert_array_equal(
+        HeatMap(x=X, y=[0.0], values=values[np.newaxis], scale=Axis()).values, [gaps]
+    )
+
+
 def test_values_come_through_a_process_of_their_own_as_they_were():
     section = Section(
         title="s",

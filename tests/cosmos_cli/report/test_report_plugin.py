@@ -145,6 +145,10 @@ BROKEN = {
         "    return [Section(title='s', blocks=[table])]",
         "figures() of ./rover.py:simulation: table 't': row 1 has 2 cells, the head 1",
     ),
+    "forgets to return": (
+        "def figures(run):\n    []",
+        "figures.py:1: figures() returned nothing: is there no `return`?",
+    ),
     "draws what does not fit together": (
         "from madns_runtime.analysis.values import *\n"
         "def figures(run):\n    return [Series(x=[1, 2], y=[1])]",
@@ -217,6 +221,16 @@ def test_arrays_and_numbers_that_are_not_finite_are_lists_and_null_in_the_json(
     assert set(compared) == {"rover", *KEPT_NAMES}, "no simulation may be called like a key"
 
 
+def test_a_comparison_that_returns_nothing_is_a_remark(drive, tmp_path, capsys):
+    drive(), drive(north_m=7.0)
+    (tmp_path / "figures.py").write_text("def compare(a, b):\n    a.streams")
+
+    assert app.run(["diff", "1", "2", "--json", "--quiet"]) == 0
+    remarks = json.loads(capsys.readouterr().out)["remarks"]
+
+    assert any("figures.py:1: compare() returned nothing" in remark for remark in remarks)
+
+
 @pytest.mark.parametrize(
     ("values", "fault"),
     [
@@ -259,7 +273,11 @@ def test_numbers_of_a_simulation_stand_in_the_json_and_never_over_the_run_s_own(
 
 @pytest.mark.parametrize(
     ("body", "fault"),
-    [("1 / 0", "ZeroDivisionError"), ("return [3]", "document() must return a mapping, got list")],
+    [
+        ("1 / 0", "ZeroDivisionError"),
+        ("return [3]", "document() must return a mapping, got list"),
+        ("{'driven_m': 5.0}", "figures.py:1: document() returned nothing: is there no `return`?"),
+    ],
 )
 def test_a_simulation_that_fails_to_tell_its_numbers_is_named(drive, tmp_path, body, fault):
     made = drive()
