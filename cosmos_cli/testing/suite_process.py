@@ -118,9 +118,7 @@ class SuiteProcess:
 
     def kill(self) -> None:
         """End it and all that it started, at once."""
-        with contextlib.suppress(
-            OSError
-        ):  # out of descriptors, say: the group is killed all the same
+        with contextlib.suppress(OSError):  # without descriptors the group is killed all the same
             self._run = self._living_run()
         self._ending = Ending.KILLED
         signal_group(self.pid, signal.SIGKILL)

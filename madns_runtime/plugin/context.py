@@ -217,9 +217,9 @@ def describe_exception(
     """
     Return which call of a plug-in raised what, and in which file and line: all of it in the first line.
 
-    What the error says beyond its own first line follows, for verdicts show no more than one. The place is the innermost line of the plug-in's own folder, not that of a library which it called; of what was
-    raised before its first line, as by arguments that it does not take, where it is written. Errors that blame the
-    user's file say all by themselves.
+    Further lines of the error follow, for verdicts show no more than one. The place is the innermost line of the
+    plug-in's own folder, not that of a library which it called; of what was raised before its first line, as by
+    arguments that it does not take, where it is written. Errors that blame the user's file say all by themselves.
 
     Args:
         error: What was caught, one call above the plug-in.

@@ -56,7 +56,7 @@ class SocketLink(StreamTransport):
 
     @property
     def awaited(self) -> str:
-        """What shows that the software is there, for people."""
+        """Return what shows that the software is there, in words."""
         if self._listens:
             return f"it to connect to {self.address}"
         return f"it to take a connection at {self.address}"
@@ -191,7 +191,7 @@ class UdpLink(Transport):
 
     @property
     def awaited(self) -> str:
-        """What shows that the software is there, for people."""
+        """Return what shows that the software is there, in words."""
         return f"its first datagram at {self.address}"
 
     def open(self) -> None:

@@ -59,7 +59,7 @@ class Transport(ABC):
 
     @property
     def awaited(self) -> str:
-        """What shows that the software is there, for people."""
+        """Return what shows that the software is there, in words."""
         return "its first word"
 
     @abstractmethod
