@@ -118,6 +118,8 @@ class Histogram:
                 f"Histogram: expected one edge more than counts, got {len(self.edges)} edges"
                 f" and {len(self.counts)} counts"
             )
+        if not np.all(self.edges[1:] >= self.edges[:-1]):
+            raise ValueError("Histogram: expected edges that ascend, none of them NaN")
         _hold_mark(self, "name")
 
 

@@ -71,9 +71,14 @@ def check_schema(schema: StreamSchema) -> None:
         schema.shape != "array"
         or any((places is None) != whole for places, whole in zip(digits, is_int, strict=True))
     ):
+        unfit = [
+            field.name
+            for field, places, whole in zip(schema.fields, digits, is_int, strict=True)
+            if (places is None) != whole
+        ]
         raise PluginError(
             f"stream {schema.name}: expected digits, 0 to {DIGITS_MAX}, of every field of kind float, ints besides,"
-            " and records that are arrays"
+            f" and records that are arrays, got {', '.join(unfit) or schema.shape}"
         )
     if schema.shape == "object" and len(names) == 1 and names[0] in CONTROL_KEYS:
         raise PluginError(f"stream {schema.name}: a single field may not be named {names[0]}")

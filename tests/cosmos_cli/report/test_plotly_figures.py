@@ -177,6 +177,8 @@ def test_values_come_through_a_process_of_their_own_as_they_were():
             "Series.x: expected real numbers, got datetime64",
         ),
         (lambda: Histogram(edges=[1], counts=[1]), "one edge more"),
+        (lambda: Histogram(edges=[0, 2, 1], counts=[1, 1]), "edges that ascend"),
+        (lambda: Histogram(edges=[0, np.nan], counts=[1]), "edges that ascend"),
         (lambda: HeatMap(x=X, y=X, values=np.ones((2, 5)), scale=Axis()), r"shape \(5, 5\)"),
         (lambda: Bars(names=["a"], values=[]), "1 names and 0 values"),
         (lambda: SpacePath(points=np.ones((3, 2))), r"shape \(N, 3\)"),
