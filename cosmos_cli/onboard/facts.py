@@ -46,7 +46,7 @@ TOOL_TIMEOUT_S = 5.0
 TIMED_OUT_STATUS = 124
 """Of `timeout`, which root's process heeds; a signal of ours it would not."""
 THROTTLED = "devices/platform/soc/soc:firmware/get_throttled"
-READ_ONLY = os.ST_RDONLY
+READ_ONLY, NO_PROGRAMS = os.ST_RDONLY, os.ST_NOEXEC
 PROCESSOR_KEYS = (
     *(b"vendor_id", b"model name", b"flags"),
     *(b"Features", b"CPU implementer", b"CPU architecture", b"CPU variant", b"CPU part"),
@@ -207,6 +207,7 @@ def _disk(root: str) -> dict[str, PlainValue]:
         "free_files": found.f_favail if found.f_files else None,
         "is_read_only": bool(found.f_flag & READ_ONLY),
         "is_writable": os.access(path, os.W_OK | os.X_OK),
+        "is_noexec": bool(found.f_flag & NO_PROGRAMS),
     }
 
 

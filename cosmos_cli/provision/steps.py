@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.models.machine_facts import MachineFacts
+from cosmos_cli.models.machine_facts import NOEXEC_CURE, MachineFacts
 from cosmos_cli.provision.desired import DesiredState
 from cosmos_cli.provision.device_steps import boot_notes, device_steps
 from cosmos_cli.provision.environment import installed_request
@@ -40,9 +40,9 @@ def plan_steps(facts: MachineFacts, desired: DesiredState) -> tuple[Step, ...]:
 
 def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     """
-    Refuse a plan that would fail midway: no room, no right to write, nobody becomes root.
+    Refuse a plan that would fail midway: no room, no right to write or to run programs, nobody becomes root.
 
-    A disk that takes nothing is refused where there is nothing to be done, too: runs record on it.
+    A disk that takes nothing, or from which nothing is run, is refused where there is nothing to be done, too.
 
     Raises:
         MachineFailure: DISK_FULL, READ_ONLY, STEP or NO_SUDO; nothing was changed.
@@ -59,6 +59,12 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
             FailureKind.STEP,
             f"{facts.user} may not write in {disk.path}",
             "choose another cosmos_root, or make that folder and give it to the user",
+        )
+    if disk.is_noexec:
+        raise MachineFailure(
+            FailureKind.STEP,
+            f"{disk.path} is on a file system that is mounted noexec: no Python package there could be loaded",
+            NOEXEC_CURE,
         )
     if not steps:
         return
