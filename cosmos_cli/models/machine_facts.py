@@ -154,6 +154,8 @@ class MachineFacts:
     radios: tuple[Radio, ...] = ()
     can_become_root: bool | None = None
     """None: nobody asked."""
+    sudo_refusal: str = ""
+    """What sudo says of a user who may not; empty where it says nothing."""
     files: Mapping[str, FileFact] = field(default_factory=dict)
     services: Mapping[str, ServiceFact] = field(default_factory=dict)
     packages: Mapping[str, str | None] = field(default_factory=dict)
@@ -220,6 +222,7 @@ class MachineFacts:
             governors_available=tuple(told.get("governors_available") or ()),
             radios=tuple(Radio(**radio) for radio in radios),
             can_become_root=told.get("sudo"),
+            sudo_refusal=told.get("sudo_refusal") or "",
             files=files_of(told),
             packages=dict(told.get("packages") or {}),
             services={k: ServiceFact(**v) for k, v in (told.get("services") or {}).items()},

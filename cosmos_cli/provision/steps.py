@@ -80,9 +80,10 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     if rooted and facts.can_become_root is False:
         shown = "; ".join(rooted[:TITLES_SHOWN_MAX])
         more = len(rooted) - TITLES_SHOWN_MAX
+        said = f" ({facts.sudo_refusal})" if facts.sudo_refusal else ""
         raise MachineFailure(
             FailureKind.NO_SUDO,
-            f"{facts.user} cannot become root without a password, which is needed for: {shown}"
+            f"{facts.user} cannot become root without a password{said}, which is needed for: {shown}"
             + (f"; and {more} more" if more > 0 else ""),
             "let the user run sudo without one (a file in /etc/sudoers.d), or take what needs root"
             " out of the inventory",

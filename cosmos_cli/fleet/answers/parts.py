@@ -166,4 +166,5 @@ _FACTS: Mapping[str, Shape] = {
         )
     ),
     "sudo": maybe(flag),
+    "sudo_refusal": maybe(text()),
 }

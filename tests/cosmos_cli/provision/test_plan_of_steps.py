@@ -128,6 +128,14 @@ def test_plan_that_needs_root_is_refused_with_its_steps_where_nobody_becomes_roo
     check_possible(facts_of(sudo=True), ROOTED)
 
 
+def test_plan_that_needs_root_is_refused_with_what_sudo_says_of_it():
+    words = "sudo: sorry, you must have a tty to run sudo"
+
+    text = refused(ROOTED, sudo=False, sudo_refusal=words)[1]
+
+    assert text.startswith(f"pi cannot become root without a password ({words}), which is needed")
+
+
 def test_full_disk_is_refused_before_anything_is_sent():
     steps = plan_steps(facts_of(), wanted(environments=(FakeEnvironment(),)))
     needed = FakeEnvironment.size_bytes + RESERVE_BYTES
