@@ -228,4 +228,5 @@ def sudo(case: Case) -> Iterator[CheckRemark]:
             level=Severity.NOTE,
             found="cannot become root without a password: no settings, packages or reboots from here",
             cure="`USER ALL=(ALL) NOPASSWD: ALL` in a file of /etc/sudoers.d there",
+            detail=case.facts.sudo_refusal,
         )

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from cosmos_cli.doctor.case import Case
 from cosmos_cli.doctor.finding import CheckRemark, Severity
+from cosmos_cli.models.machine_facts import NOEXEC_CURE
 
 FREE_BYTES_ERROR = 64 * 1024**2
 FREE_BYTES_WARNING = 512 * 1024**2
@@ -68,6 +69,13 @@ def disk_writable(case: Case) -> Iterator[CheckRemark]:
             cure="COSMOS_RUNS names another folder"
             if case.is_here
             else "cosmos_root in the inventory names a folder that may be written",
+        )
+    elif disk.is_noexec and not case.is_here:
+        yield CheckRemark(
+            level=Severity.ERROR,
+            found="its disk is mounted noexec: no Python package there can be loaded",
+            cure=NOEXEC_CURE,
+            detail=disk.path,
         )
     else:
         yield CheckRemark(found="its disk can be written")

@@ -180,7 +180,7 @@ class Evidence:
             remarks=(
                 *(causes.remarks(self._lateness_limit_s()) if causes else ()),
                 *result_remarks(result, self._summaries()),
-                *time_zero_remarks(self.config, result),
+                *time_zero_remarks(self.config, result, self.started.get("started_utc")),
                 *device_remarks(mapping_at(result, "agents"), self.devices),
                 *datagram_remarks(datagram_account(result)),
                 *undeclared_remarks(self.declared, self.scans),

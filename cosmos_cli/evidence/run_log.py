@@ -6,14 +6,18 @@ A file is named by its path in the run directory, here and on machines alike, so
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from cosmos_cli.onboard.log_tail import read_tails
+from madns_runtime.conditions.condition import HOST
 from madns_runtime.recording.records import LOG_LEVELS
 
 STDERR = "stderr"
@@ -21,6 +25,7 @@ STDERR = "stderr"
 RANKS: Mapping[str, int] = {**LOG_LEVELS, STDERR: max(LOG_LEVELS.values()) + 1}
 TEXT_CHARACTERS_MAX = 4000
 NAME_CHARACTERS_MAX = 40
+_CONTROL_LINE = re.compile(r'^\{"(?:schema|t0_utc)":[^\n]*', re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,10 +39,14 @@ class LogLine:
     """host, an agent's name, or a machine's for its standard error."""
     level: str
     text: str
+    zero_s: float | None = None
+    """Simulated time zero by the clock that `utc` was read from, as a POSIX time, s; None where it is not known."""
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for --json."""
-        return asdict(self)
+        mapping = asdict(self)
+        del mapping["zero_s"]
+        return mapping
 
 
 @dataclass(slots=True)
@@ -53,6 +62,8 @@ class LogReading:
     """Lines that are no record."""
     sources: set[str] = field(default_factory=set)
     """Sources that have a log at all."""
+    zeros_s: dict[str, float] = field(default_factory=dict)
+    """By file: simulated time zero by the clock of who wrote it, as a POSIX time, s."""
 
     def read_here(self, directory: Path, *, is_ended: bool = False) -> Iterator[list[LogLine]]:
         """
@@ -75,7 +86,11 @@ class LogReading:
             if int(told["start"]) != self.offsets.get(path, 0):
                 continue
             self.offsets[path] = int(told["end"])
-            lines += self._wanted(path, str(told["text"]))
+            text = str(told["text"])
+            if (zero_s := _zero_in(text)) is not None:
+                self.zeros_s[path] = zero_s
+            zero_s = self.zeros_s.get(path)
+            lines += (replace(line, zero_s=zero_s) for line in self._wanted(path, text))
         return in_order(lines)
 
     def _wanted(self, path: str, text: str) -> Iterator[LogLine]:
@@ -94,8 +109,41 @@ _DAMAGED = LogLine(utc=None, t_s=None, source="", level="", text="")
 
 
 def in_order(lines: Iterable[LogLine]) -> list[LogLine]:
-    """Return lines by their time; those without one stand behind the others, as they came."""
-    return sorted(lines, key=lambda line: line.utc or "~")
+    """
+    Return lines by their time; those without one stand behind the others, as they came.
+
+    A board may keep a time that is years off: lines are held against simulated time zero by the clock that
+    they were written by; those of a clock of which that is not known, as if they were the host's.
+    """
+    known = list(lines)
+    zeros_s = [line.zero_s for line in known if line.zero_s is not None]
+    common_s = next(
+        (line.zero_s for line in known if line.source == HOST and line.zero_s is not None),
+        min(zeros_s, default=0.0),
+    )
+
+    def since_zero_s(line: LogLine) -> float:
+        return _posix_s(line.utc) - (common_s if line.zero_s is None else line.zero_s)
+
+    return sorted(known, key=since_zero_s)
+
+
+def _posix_s(utc: object) -> float:
+    """Return an instant as a POSIX time, s; infinity for what is none."""
+    try:
+        return datetime.fromisoformat(utc).timestamp() if isinstance(utc, str) else math.inf
+    except (ValueError, OverflowError):
+        return math.inf
+
+
+def _zero_in(text: str) -> float | None:
+    """Return the simulated time zero that a stream's schema, or the line after it, tells; None where none does."""
+    for found in _CONTROL_LINE.finditer(text):
+        with contextlib.suppress(ValueError, RecursionError, AttributeError):
+            zero_s = _posix_s(json.loads(found[0]).get("t0_utc"))
+            if math.isfinite(zero_s):
+                return zero_s
+    return None
 
 
 def _source_of(path: str) -> str:

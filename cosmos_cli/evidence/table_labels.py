@@ -24,6 +24,8 @@ from madns_runtime.errors import ConfigurationError
 
 EPOCH = "epoch_utc"
 LOCKSTEP_ZERO_UTC = "1970-01-01T00:00:00Z"
+ZERO_OFF_H_MAX = 1.0
+"""Time between a run's start and its simulated time zero that no remark is made of: to load and to set up takes less."""
 US_PER_S = 1e6
 NEVER_US = np.iinfo(np.int64).min
 YEARS_US = 1e17
@@ -92,18 +94,48 @@ def run_labels(run: RunDirectory) -> AgentLabels:
     return agent_labels(run.read_json(run.plan_json), run.read_json(run.result_json))
 
 
-def time_zero_remarks(config: RunConfig | None, result: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a remark where simulated time zero is told, and is no time that tables could tell."""
+def time_zero_remarks(
+    config: RunConfig | None, result: Mapping[str, Any], started_utc: object = None
+) -> tuple[str, ...]:
+    """
+    Return a remark where simulated time zero is told, and is no time that tables could tell, or far from the run's start.
+
+    Args:
+        config: The run's; None where it is lost.
+        result: What its host reported.
+        started_utc: When the run was started, by the clock of the computer that did; ISO 8601.
+    """
     told = _told_zero(config, result)
-    if told is None or _parse_utc(told) is not None:
+    if told is None:
         return ()
+    if (zero := _parse_utc(told)) is not None:
+        start = _parse_utc(started_utc)
+        if start is None or not _is_by_a_clock(config, result):
+            return ()
+        ahead_h = (zero - start).total_seconds() / 3600
+        if abs(ahead_h) <= ZERO_OFF_H_MAX:
+            return ()
+        side = "after" if ahead_h > 0 else "before"
+        return (
+            f"simulated_utc in tables, and utc of what the host recorded, are by the clock of the host's machine: to it the run began"
+            f" {abs(ahead_h):.0f} h {side} it was started here; let a time service set the one that is wrong",
+        )
     expected = f"expected an {EPOCH} such as 2017-03-07T12:00:00Z, got {told!r:.80}"
     return (f"tables have no simulated_utc: {expected}",)
 
 
-def _told_zero(config: RunConfig | None, result: Mapping[str, Any]) -> object:
+def _is_by_a_clock(config: RunConfig | None, result: Mapping[str, Any]) -> bool:
+    """Tell whether simulated time zero is what the clock of the host's machine showed."""
+    return not _epochs(config, result) and not (config is not None and config.time.is_lockstep)
+
+
+def _epochs(config: RunConfig | None, result: Mapping[str, Any]) -> list[object]:
     places = (mapping_at(result, "simulation"), config.parameters if config else {})
-    if epochs := [place[EPOCH] for place in places if EPOCH in place]:
+    return [place[EPOCH] for place in places if EPOCH in place]
+
+
+def _told_zero(config: RunConfig | None, result: Mapping[str, Any]) -> object:
+    if epochs := _epochs(config, result):
         return next(filter(None, epochs), None)
     if config is not None and config.time.is_lockstep:
         return LOCKSTEP_ZERO_UTC

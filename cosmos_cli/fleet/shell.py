@@ -15,6 +15,8 @@ import shlex
 NO_SUDO_MARK = "cosmos: no sudo"
 BEGIN_MARK = "cosmos: the command begins"
 FORCED_AFTER_S = 2
+SYSTEM_PATH = "case :$PATH: in *:/usr/bin:*) ;; *) PATH=$PATH:/usr/bin:/bin; export PATH;; esac; "
+"""Begins a script: a start-up file may have left a PATH without the system's own programs, such as mkdir and sudo."""
 
 # $1 is the command. `read` returns at the end of standard input only; sshd and LocalConnection start each
 # command in a session, thus a process group, of its own. A subshell keeps an `exit` in the command from
@@ -58,7 +60,7 @@ def watched(command: str, *, is_root: bool = False, has_mark: bool = False) -> s
         f' exec sudo -n /bin/sh -c {shlex.quote(_WATCH)} sh "$1"; fi; '
     )
     return for_login_shell(
-        f"{begin}set -- {shlex.quote(command)}; {root if is_root else ''}{_WATCH}"
+        f"{SYSTEM_PATH}{begin}set -- {shlex.quote(command)}; {root if is_root else ''}{_WATCH}"
     )
 
 

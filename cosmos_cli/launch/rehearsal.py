@@ -29,7 +29,7 @@ from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.launch.preparation import says_address
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.loading import ScenarioFile
-from cosmos_cli.models.machine_facts import MachineFacts
+from cosmos_cli.models.machine_facts import NOEXEC_CURE, MachineFacts
 from cosmos_cli.provision import STORE_PARTS
 from cosmos_cli.provision.before_run import Cargo, cargo_of, environment_key_of
 from cosmos_cli.provision.environment import ask_installed, installed_request
@@ -94,6 +94,9 @@ class MachineRehearsal:
             found.append(
                 Obstacle(text=f"{disk.path} cannot be written", cure="cosmos doctor tells why")
             )
+        if disk.is_noexec:
+            text = f"{disk.path} is mounted noexec: no Python package there can be loaded"
+            found.append(Obstacle(text=text, cure=NOEXEC_CURE))
         needed = max(FREE_BYTES_MIN, self.bytes_missing + self.record_bytes)
         if disk.free_bytes < needed:
             found.append(

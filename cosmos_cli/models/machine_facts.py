@@ -92,6 +92,9 @@ class Interpreter:
     has_ensurepip: bool = True
 
 
+NOEXEC_CURE = "choose another cosmos_root, or mount it with the option exec (`user` and `users` in /etc/fstab mean noexec)"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disk:
     """The file system that COSMoS's folder is on, or will be."""
@@ -102,6 +105,8 @@ class Disk:
     is_read_only: bool = False
     is_writable: bool = True
     """Whether the user may write in the last folder of the path that exists."""
+    is_noexec: bool = False
+    """Whether it is mounted so that no program and no compiled module can be run from it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,6 +154,8 @@ class MachineFacts:
     radios: tuple[Radio, ...] = ()
     can_become_root: bool | None = None
     """None: nobody asked."""
+    sudo_refusal: str = ""
+    """What sudo says of a user who may not; empty where it says nothing."""
     files: Mapping[str, FileFact] = field(default_factory=dict)
     services: Mapping[str, ServiceFact] = field(default_factory=dict)
     packages: Mapping[str, str | None] = field(default_factory=dict)
@@ -215,6 +222,7 @@ class MachineFacts:
             governors_available=tuple(told.get("governors_available") or ()),
             radios=tuple(Radio(**radio) for radio in radios),
             can_become_root=told.get("sudo"),
+            sudo_refusal=told.get("sudo_refusal") or "",
             files=files_of(told),
             packages=dict(told.get("packages") or {}),
             services={k: ServiceFact(**v) for k, v in (told.get("services") or {}).items()},
@@ -261,7 +269,7 @@ _BOARD_KEYS = (
     *("model", "machine", "bits", "node", "kernel", "processors"),
     *("is_preempt_rt", "processor_kind"),
 )
-_DISK_KEYS = ("path", "total_bytes", "free_bytes", "is_read_only", "is_writable")
+_DISK_KEYS = ("path", "total_bytes", "free_bytes", "is_read_only", "is_writable", "is_noexec")
 
 
 def files_of(told: Mapping[str, Any]) -> dict[str, FileFact]:

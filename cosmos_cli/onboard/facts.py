@@ -30,6 +30,7 @@ from cosmos_cli.onboard.request_loop import (
     PlainValue,
     VerbRequest,
     handler_of,
+    last_words,
     libc_version,
     refusal_of,
     verb,
@@ -42,11 +43,12 @@ if TYPE_CHECKING:
 CONDITION_TIMEOUT_S = 60.0
 SUDO_TIMEOUT_S = 20.0
 SUDO_POLL_S = 0.005
+SUDO_BYTES_MAX = 4096
 TOOL_TIMEOUT_S = 5.0
 TIMED_OUT_STATUS = 124
 """Of `timeout`, which root's process heeds; a signal of ours it would not."""
 THROTTLED = "devices/platform/soc/soc:firmware/get_throttled"
-READ_ONLY = os.ST_RDONLY
+READ_ONLY, NO_PROGRAMS = os.ST_RDONLY, os.ST_NOEXEC
 PROCESSOR_KEYS = (
     *(b"vendor_id", b"model name", b"flags"),
     *(b"Features", b"CPU implementer", b"CPU architecture", b"CPU variant", b"CPU part"),
@@ -101,7 +103,7 @@ def facts(request: VerbRequest) -> dict[str, PlainValue]:
         "services": {name: _service(name) for name in asked.get("services") or ()},
         **look(request),
         "packages": _packages(asked.get("packages") or ()),
-        "sudo": _end_sudo(sudo) if is_sudo_asked else None,
+        **(_end_sudo(sudo) if is_sudo_asked else {"sudo": None, "sudo_refusal": None}),
     }
 
 
@@ -207,6 +209,7 @@ def _disk(root: str) -> dict[str, PlainValue]:
         "free_files": found.f_favail if found.f_files else None,
         "is_read_only": bool(found.f_flag & READ_ONLY),
         "is_writable": os.access(path, os.W_OK | os.X_OK),
+        "is_noexec": bool(found.f_flag & NO_PROGRAMS),
     }
 
 
@@ -366,15 +369,28 @@ def _start_sudo() -> subprocess.Popen[bytes] | None:
             ["sudo", "-n", "true"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
         )
     return None
 
 
-def _end_sudo(sudo: subprocess.Popen[bytes] | None) -> bool:
+def _end_sudo(sudo: subprocess.Popen[bytes] | None) -> dict[str, PlainValue]:
+    """Tell whether this user may become root, and of one who may not what sudo says of it."""
     if sudo is None:
-        return os.geteuid() == 0
+        is_root = os.geteuid() == 0
+        return {"sudo": is_root, "sudo_refusal": None if is_root else "there is no sudo"}
     until_s = time.monotonic() + SUDO_TIMEOUT_S
     while sudo.poll() is None and time.monotonic() < until_s:
         time.sleep(SUDO_POLL_S)
-    return sudo.returncode == 0
+    if sudo.returncode is None:
+        return {"sudo": False, "sudo_refusal": f"sudo has not ended in {SUDO_TIMEOUT_S:g} s"}
+    assert sudo.stderr is not None
+    os.set_blocking(sudo.stderr.fileno(), False)  # who else may hold it is not waited for
+    said = b""
+    with contextlib.suppress(OSError):
+        said = os.read(sudo.stderr.fileno(), SUDO_BYTES_MAX)
+    is_refused = sudo.returncode != 0
+    return {
+        "sudo": not is_refused,
+        "sudo_refusal": last_words(said).rpartition("\n")[2] if is_refused else None,
+    }

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.models.machine_facts import MachineFacts
+from cosmos_cli.models.machine_facts import NOEXEC_CURE, MachineFacts
 from cosmos_cli.provision.desired import DesiredState
 from cosmos_cli.provision.device_steps import boot_notes, device_steps
 from cosmos_cli.provision.environment import installed_request
@@ -40,9 +40,9 @@ def plan_steps(facts: MachineFacts, desired: DesiredState) -> tuple[Step, ...]:
 
 def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     """
-    Refuse a plan that would fail midway: no room, no right to write, nobody becomes root.
+    Refuse a plan that would fail midway: no room, no right to write or to run programs, nobody becomes root.
 
-    A disk that takes nothing is refused where there is nothing to be done, too: runs record on it.
+    A disk that takes nothing, or from which nothing is run, is refused where there is nothing to be done, too.
 
     Raises:
         MachineFailure: DISK_FULL, READ_ONLY, STEP or NO_SUDO; nothing was changed.
@@ -60,6 +60,12 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
             f"{facts.user} may not write in {disk.path}",
             "choose another cosmos_root, or make that folder and give it to the user",
         )
+    if disk.is_noexec:
+        raise MachineFailure(
+            FailureKind.STEP,
+            f"{disk.path} is on a file system that is mounted noexec: no Python package there could be loaded",
+            NOEXEC_CURE,
+        )
     if not steps:
         return
     needed_bytes = sum(step.size_bytes for step in steps) + RESERVE_BYTES
@@ -74,9 +80,10 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     if rooted and facts.can_become_root is False:
         shown = "; ".join(rooted[:TITLES_SHOWN_MAX])
         more = len(rooted) - TITLES_SHOWN_MAX
+        said = f" ({facts.sudo_refusal})" if facts.sudo_refusal else ""
         raise MachineFailure(
             FailureKind.NO_SUDO,
-            f"{facts.user} cannot become root without a password, which is needed for: {shown}"
+            f"{facts.user} cannot become root without a password{said}, which is needed for: {shown}"
             + (f"; and {more} more" if more > 0 else ""),
             "let the user run sudo without one (a file in /etc/sudoers.d), or take what needs root"
             " out of the inventory",

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cosmos_cli.evidence.completeness import ExpectedRecords
-from cosmos_cli.evidence.run_directory import RunDirectory, begin_run, create_run
+from cosmos_cli.evidence.run_directory import RunDirectory, begin_run, create_run, write_json
 from madns_runtime.config import Agents, Recording, RunConfig, TimeSettings
 from madns_runtime.processes import ProcessEntry
 from madns_runtime.recording.record_files import RecordFiles
@@ -64,9 +64,15 @@ class SyntheticRun:
         self.ticks = round(self.config.time.duration_s * self.config.agents.tick_hz)
         self.run: RunDirectory = create_run(root, self.config.scenario)
         self.config = dataclasses.replace(self.config, run=self.run.name)
-        begin_run(self.run, self.config, {"machines": {MACHINE: list(self.names)}})
+        self._begin()
         self.expected = ExpectedRecords.of(self.config, (MACHINE,))
         self.records: dict[str, dict] = {}
+
+    def _begin(self) -> None:
+        """Write what is known at the start, by the very clock that the synthetic host recorded."""
+        begin_run(self.run, self.config, {"machines": {MACHINE: list(self.names)}})
+        document = self.run.read_json(self.run.run_json)
+        write_json(self.run.run_json, {**document, "started_utc": T0_UTC})
 
     def write(
         self,
@@ -77,7 +83,7 @@ class SyntheticRun:
     ) -> SyntheticRun:
         if with_states:
             self.config = dataclasses.replace(self.config, simulation="constellation")
-            begin_run(self.run, self.config, {"machines": {MACHINE: list(self.names)}})
+            self._begin()
         host = self.recorder("host", "host", EVENTS, LOG)
         host.record(
             "events", {"t_s": 0.0, "utc": T0_UTC, "event": "SIMULATION_START", "why": "all"}

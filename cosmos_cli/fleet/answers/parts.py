@@ -140,6 +140,7 @@ _FACTS: Mapping[str, Shape] = {
             "free_files": maybe(size),
             "is_read_only": flag,
             "is_writable": flag,
+            "is_noexec": flag,
         }
     ),
     "memory": record({"total_bytes": maybe(size), "available_bytes": maybe(size)}),
@@ -165,4 +166,5 @@ _FACTS: Mapping[str, Shape] = {
         )
     ),
     "sudo": maybe(flag),
+    "sudo_refusal": maybe(text()),
 }

@@ -71,6 +71,28 @@ def test_lines_come_in_order_of_time_and_those_without_one_at_the_end(made, caps
     ]
 
 
+def write_log(path, zero, *records):
+    """Write a stream whose schema, or the line after it as of a host, tells simulated time zero."""
+    told = SCHEMA.replace("}\n", f',"t0_utc":"{zero}"}}\n')
+    late = SCHEMA.replace("}\n", ',"t0_utc":null}\n') + f'{{"t0_utc":"{zero}"}}\n'
+    path.write_text((late if path.parent.name == "host" else told) + "".join(records))
+
+
+def test_lines_of_boards_whose_clocks_are_years_off_come_in_order_of_time(made, capsys):
+    behind, ahead = (
+        {"utc": f"{day}T12:00:01Z", "level": "info", "text": f"{day} {clock}"}
+        for day, clock in (("2006-05-05", "early"), ("2056-05-05", "late"))
+    )
+    write_log(made / "host/log.jsonl", "2026-01-01T00:00:00.000000Z", record(2, "info", "host 2"))
+    write_log(made / "agents/a1/log.jsonl", "2006-05-05T11:59:58Z", json.dumps(behind) + "\n")
+    write_log(made / "agents/a2/log.jsonl", "2056-05-05T12:00:00Z", json.dumps(ahead) + "\n")
+    (made / "agents/a1/log.2.jsonl").unlink()
+
+    expected = ["2056-05-05 late", "host 2", "2006-05-05 early", "Traceback", "ValueError"]
+    assert texts(capsys) == expected
+    assert texts(capsys, "--lines", "4") == expected[1:]
+
+
 def test_text_kept_beside_an_agents_records_is_told_as_that_agents(made, capsys):
     (made / "agents/a2/flight_stderr.txt").write_text("of a program\n")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from harness.synthetic_run import MACHINE, SyntheticRun, make_config
+from harness.synthetic_run import MACHINE, T0_UTC, SyntheticRun, make_config
 
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.errors import InputError
@@ -509,6 +509,39 @@ def test_time_zero_that_is_no_time_is_remarked_on_as_tables_have_no_utc(
         "tables have no simulated_utc: expected an epoch_utc such as 2017-03-07T12:00:00Z, got 'noon\\x1b'"
         in made.run.read_json(made.run.run_json)["remarks"]
     )
+
+
+@pytest.mark.parametrize(
+    ("t0_utc", "words"),
+    [
+        ("2006-12-02T12:00:00Z", "the run began 175320 h before it was started here"),
+        ("2026-12-03T12:00:00Z", "the run began 24 h after it was started here"),
+        ("2026-12-02T12:20:00Z", ""),
+        (None, ""),
+    ],
+)
+def test_time_zero_by_a_clock_of_the_hosts_machine_that_is_wrong_is_remarked_on(
+    tmp_path, t0_utc, words
+):
+    made = SyntheticRun(tmp_path, make_config()).write()
+    write_json(made.run.run_json, {"started_utc": "2026-12-02T12:00:00.000Z"})
+
+    finish_run(made.run, {**made.result(), "t0_utc": t0_utc}, made.expected, has_report=False)
+
+    remarks = made.run.read_json(made.run.run_json)["remarks"]
+    found = [remark for remark in remarks if "simulated_utc" in remark]
+    assert len(found) == bool(words)
+    assert not words or words in found[0]
+
+
+def test_epoch_of_a_simulation_is_no_clock_of_a_machine(tmp_path):
+    made = SyntheticRun(tmp_path, make_config(parameters={"epoch_utc": T0_UTC})).write()
+    write_json(made.run.run_json, {"started_utc": "2026-12-02T12:00:00.000Z"})
+
+    finish_run(made.run, made.result(), made.expected, has_report=False)
+
+    remarks = made.run.read_json(made.run.run_json)["remarks"]
+    assert not [remark for remark in remarks if "simulated_utc" in remark]
 
 
 def test_nothing_is_labelled_where_time_zero_is_not_known(tmp_path):

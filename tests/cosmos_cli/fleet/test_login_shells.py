@@ -1,5 +1,7 @@
 """Every command that a machine is given is one that each login shell reads alike: POSIX's, fish, tcsh."""
 
+import dataclasses
+import os
 import re
 import shlex
 import subprocess
@@ -79,3 +81,54 @@ ARGUMENT_BYTES_MAX = 128 * 1024
 
 def test_script_with_many_quotation_marks_still_fits_one_argument():
     assert len(watched("echo 'it'\n" * 800, is_root=True)) < ARGUMENT_BYTES_MAX
+
+
+PATHS_LEFT = ["/nowhere", "", "/nowhere:/usr/local/bin"]
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("path", PATHS_LEFT)
+def test_program_is_started_where_the_path_lacks_the_systems_own_programs(tmp_path, path):
+    program = dataclasses.replace(PROGRAM, run_directory=f"{tmp_path}/runs/1")
+    paths = dataclasses.replace(PATHS, root=str(tmp_path), python="/usr/bin/true")
+
+    done = run_with_path(start_command(program, paths), path)
+
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("path", PATHS_LEFT)
+def test_helper_finds_sudo_and_a_watcher_sleep_where_the_path_lacks_them(tmp_path, path):
+    python = tmp_path / "python3"
+    python.write_text("#!/bin/sh\ncommand -v id\n")
+    python.chmod(0o755)
+
+    helper = run_with_path(helper_command(str(python), 1), path)
+    asked = run_with_path(watched("command -v id"), path)
+
+    assert [helper.stdout, asked.stdout] == [b"/usr/bin/id\n"] * 2
+
+
+@pytest.mark.process
+def test_path_that_has_the_systems_programs_stays_as_it_is():
+    done = run_with_path(watched("echo $PATH"), "/opt/mine:/usr/bin:/sbin")
+
+    assert done.stdout == b"/opt/mine:/usr/bin:/sbin\n"
+
+
+def run_with_path(command, path):
+    """Run a command as a login shell with this PATH does; its standard input stays open as long as it runs."""
+    reads, writes = os.pipe()
+    try:
+        return subprocess.run(
+            ["/bin/sh", "-c", command],
+            env={"PATH": path},
+            stdin=reads,
+            capture_output=True,
+            timeout=60,
+            check=False,
+        )
+    finally:
+        os.close(reads)
+        os.close(writes)

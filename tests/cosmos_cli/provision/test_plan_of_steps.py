@@ -107,6 +107,14 @@ def test_disk_that_takes_no_records_is_refused_though_nothing_is_to_be_done():
     assert refused((), disk={"is_writable": False})[0] == "step"
 
 
+@pytest.mark.parametrize("steps", [(), ROOTLESS], ids=["nothing to do", "something"])
+def test_disk_from_which_nothing_can_be_run_is_refused_before_anything_is_changed(steps):
+    assert refused(steps, disk={"is_noexec": True}) == (
+        "step",
+        "/home/pi is on a file system that is mounted noexec: no Python package there could be loaded",
+    )
+
+
 def test_plan_without_root_needs_none():
     check_possible(facts_of(sudo=False), ROOTLESS)
 
@@ -118,6 +126,14 @@ def test_plan_that_needs_root_is_refused_with_its_steps_where_nobody_becomes_roo
         " setting cosmos_wifi: on -> off; setting cosmos_bluetooth: on -> off",
     )
     check_possible(facts_of(sudo=True), ROOTED)
+
+
+def test_plan_that_needs_root_is_refused_with_what_sudo_says_of_it():
+    words = "sudo: sorry, you must have a tty to run sudo"
+
+    text = refused(ROOTED, sudo=False, sudo_refusal=words)[1]
+
+    assert text.startswith(f"pi cannot become root without a password ({words}), which is needed")
 
 
 def test_full_disk_is_refused_before_anything_is_sent():
