@@ -155,7 +155,7 @@ class MachineFacts:
     can_become_root: bool | None = None
     """None: nobody asked."""
     sudo_refusal: str = ""
-    """What sudo says of a user who may not; empty where it says nothing."""
+    """Words of sudo on a user who may not; empty where it says nothing."""
     files: Mapping[str, FileFact] = field(default_factory=dict)
     services: Mapping[str, ServiceFact] = field(default_factory=dict)
     packages: Mapping[str, str | None] = field(default_factory=dict)

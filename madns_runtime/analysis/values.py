@@ -113,10 +113,10 @@ class Histogram:
     def __post_init__(self) -> None:
         """Refuse what does not fit together."""
         hold_arrays(self, {"edges": 1, "counts": 1})
-        if len(self.edges) != len(self.counts) + 1:
+        edges, counts = len(self.edges), len(self.counts)
+        if edges != counts + 1:
             raise ValueError(
-                f"Histogram: expected one edge more than counts, got {len(self.edges)} edges"
-                f" and {len(self.counts)} counts"
+                f"Histogram: expected one edge more than counts, got {edges} of {counts}"
             )
         if not np.all(self.edges[1:] >= self.edges[:-1]):
             raise ValueError("Histogram: expected edges that ascend, none of them NaN")
