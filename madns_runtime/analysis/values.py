@@ -115,9 +115,7 @@ class Histogram:
         hold_arrays(self, {"edges": 1, "counts": 1})
         edges, counts = len(self.edges), len(self.counts)
         if edges != counts + 1:
-            raise ValueError(
-                f"Histogram: expected one edge more than counts, got {edges} of {counts}"
-            )
+            raise ValueError(f"Histogram: expected one edge more than {counts} counts, got {edges}")
         if not np.all(self.edges[1:] >= self.edges[:-1]):
             raise ValueError("Histogram: expected edges that ascend, none of them NaN")
         _hold_mark(self, "name")
