@@ -347,6 +347,8 @@ def test_apt_goes_on_to_its_end_when_nobody_listens_any_more(apt: PlayedApt) -> 
 def test_machine_without_apt_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "python3").symlink_to(sys.executable)
     monkeypatch.setenv("PATH", str(tmp_path))
+    # Else the system's own programs are put behind it, and apt is one.
+    monkeypatch.setattr("cosmos_cli.fleet.helper.SYSTEM_PATH", "")
     target = Target(name="pi01", address="127.0.0.1", connection="local")
 
     with (
