@@ -13,8 +13,9 @@ import typer
 from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.diff.compare import Comparison, Selection, compare
 from cosmos_cli.diff.document import several_documents, to_document
+from cosmos_cli.diff.page import write_comparisons
 from cosmos_cli.diff.side import Side, check_comparable, open_side
-from cosmos_cli.diff.terminal import print_comparison
+from cosmos_cli.diff.terminal import count_figures, print_comparison
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_search import find_run
@@ -24,8 +25,10 @@ from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.name_ranges import compact
+from cosmos_cli.ui.plural import counted
 from cosmos_cli.ui.progress import told_progress
 from cosmos_cli.view.factory import make_view
+from madns_runtime.partial_file import check_replaceable
 
 RUNS_MAX = 16
 """Runs of one comparison."""
@@ -59,6 +62,14 @@ def diff(
         float | None,
         typer.Option("--duration", metavar="S", help="With --run: simulated time of each, s."),
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(
+            "--html",
+            metavar="FILE",
+            help="Write the comparison to FILE as well, with the figures that its simulation draws.",
+        ),
+    ] = None,
     folder: RunsOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -72,6 +83,8 @@ def diff(
     console = Console(json=as_json, quiet=quiet, instead=instead)
     code = ExitCode.OK
     names = [a, *others]
+    if html is not None:
+        _check_replaceable(html)
     if len(names) > RUNS_MAX:
         raise InputError(f"expected at most {RUNS_MAX} runs, got {len(names)}")
     if run_first:
@@ -86,13 +99,40 @@ def diff(
     comparisons = _compare_each(
         found, names, tuple(agents or ()), tuple(streams or ()), console=console
     )
+    _tell(console, comparisons, html)
+    if code is ExitCode.OK and expect_same and not all(one.is_same for one in comparisons):
+        code = ExitCode.RUN_FAILED
+    raise typer.Exit(int(code))
+
+
+def _tell(console: Console, comparisons: Sequence[Comparison], html: Path | None) -> None:
+    """Print comparisons, and write their page."""
     documents = [to_document(one) for one in comparisons]
     console.print_json(documents[0] if len(documents) == 1 else several_documents(documents))
     for comparison in comparisons:
         print_comparison(console, comparison)
-    if code is ExitCode.OK and expect_same and not all(one.is_same for one in comparisons):
-        code = ExitCode.RUN_FAILED
-    raise typer.Exit(int(code))
+    if html is not None:
+        try:
+            write_comparisons(comparisons, html)
+        except OSError as error:
+            raise InputError(f"{html}: cannot be written: {error.strerror or error}") from error
+        console.say(f"comparison written to {html}")
+    elif figures := sum(map(count_figures, comparisons)):
+        console.say(f"{counted(figures, 'figure')} more with --html FILE")
+
+
+def _check_replaceable(path: Path) -> None:
+    """
+    Refuse a file that could not be written, before anything is run or read for it.
+
+    Raises:
+        InputError: It could not.
+    """
+    try:
+        check_replaceable(path)
+        path.parent.stat()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def _overrides(set_: list[str] | None, duration_s: float | None) -> list[str]:

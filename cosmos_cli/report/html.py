@@ -69,7 +69,27 @@ def write_report(run: RunDirectory, document: Mapping[str, Any], path: Path | No
 
 
 def render_page(document: Mapping[str, Any], sections: Sequence[Section]) -> str:
-    """Return the whole page."""
+    """Return the whole page of a run."""
+    return render_sections(
+        "page.html",
+        sections,
+        document=document,
+        facts=list(_facts(document)),
+        tiles=figures_of(document),
+        gaps=_gaps(document),
+        versions=mapping_at(document, "versions"),
+    )
+
+
+def render_sections(template: str, sections: Sequence[Section], **texts: Any) -> str:
+    """
+    Return a whole page.
+
+    Args:
+        template: Name of a template that extends layout.html, which shows the sections and draws their figures.
+        sections: Chapters.
+        texts: Values for the template's own part.
+    """
     drawn = _Drawn()
     told = [
         {"title": s.title, "intro": s.intro, "blocks": [drawn.block(block) for block in s.blocks]}
@@ -79,12 +99,8 @@ def render_page(document: Mapping[str, Any], sections: Sequence[Section]) -> str
     loader = environment.loader
     assert loader is not None
     css, script = (loader.get_source(environment, f"page.{kind}")[0] for kind in ("css", "js"))
-    return environment.get_template("page.html").render(
-        document=document,
-        facts=list(_facts(document)),
-        tiles=figures_of(document),
-        gaps=_gaps(document),
-        versions=mapping_at(document, "versions"),
+    return environment.get_template(template).render(
+        **texts,
         sections=told,
         rows_open_max=ROWS_OPEN_MAX,
         css=Markup(css),

@@ -391,7 +391,7 @@ class SimulationDifference:
     document: Mapping[str, Any]
     """Part of `cosmos diff --json` under the simulation's name: plain values, units in their names."""
     blocks: Sequence[Block]
-    """The same for a person: tables and remarks."""
+    """The same for a person: tables and remarks, and figures for the page that `cosmos diff --html` writes."""
 
 
 def headings(first: str, *numbers: str) -> tuple[Heading, ...]:

@@ -90,8 +90,12 @@ def test_comparison_tells_of_cars_what_their_simulation_knows(cosmos, lockstep):
 
     first, second = _find(found, "mean_speed_m_s")["agent-02"]
     assert first > second > 1.0
-    told = cosmos("diff", lockstep["run"], other["run"])
+    page = cosmos.folder / "comparison.html"
+    told = cosmos("diff", lockstep["run"], other["run"], "--html", page)
     assert "Mean speeds of cars" in told
+    drawn = page.read_text("utf-8")
+    assert "Mean speeds of cars" in drawn
+    assert "Speeds of both runs" in drawn
 
 
 @pytest.mark.process

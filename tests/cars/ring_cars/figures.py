@@ -32,8 +32,13 @@ def figures(run: RecordedRun) -> list[Section]:
 
 
 def compare(a: ComparedRun, b: ComparedRun) -> SimulationDifference:
-    """Return the mean speed of each car in both runs."""
+    """Return the mean speed of each car in both runs, and of all cars over time."""
     of_a, of_b = (_mean_speeds_m_s(one.run) for one in (a, b))
+    over_time = [
+        Series(x=x, y=y, name=f"{name}, car {car}")
+        for name, one in (("first", a), ("second", b))
+        for car, (x, y) in _speeds_m_s(one.run).items()
+    ]
     rows = [[car, of_a.get(car), of_b.get(car)] for car in dict.fromkeys((*of_a, *of_b))]
     return SimulationDifference(
         document={"mean_speed_m_s": {str(car): [first, second] for car, first, second in rows}},
@@ -42,9 +47,16 @@ def compare(a: ComparedRun, b: ComparedRun) -> SimulationDifference:
                 title="Mean speeds of cars",
                 headings=headings("car", "first, m/s", "second, m/s"),
                 rows=rows,
-            )
+            ),
+            *_speed_figure(over_time),
         ],
     )
+
+
+def _speed_figure(marks: list[Series]) -> list[Figure]:
+    y = Axis(quantity="speed", unit="m/s", from_zero=True)
+    choices = [FigureChoice(marks=marks)]
+    return [Figure(title="Speeds of both runs", y=y, choices=choices)] if marks else []
 
 
 def road_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
@@ -79,9 +91,13 @@ def _figure(title: str, lines: Lines, y: Axis, limits: list[LimitLine] | None = 
     return Figure(title=title, y=y, choices=[FigureChoice(marks=marks)], limits=limits or ())
 
 
-def _mean_speeds_m_s(run: RecordedRun) -> dict[str, float]:
+def _speeds_m_s(run: RecordedRun) -> Lines:
     table = run.tables.get("host_road")
     if table is None or not table.has("speed_m_s", "agent"):
         return {}
-    found = run.series(table, "speed_m_s")[0]
+    return run.series(table, "speed_m_s")[0]
+
+
+def _mean_speeds_m_s(run: RecordedRun) -> dict[str, float]:
+    found = _speeds_m_s(run)
     return {car: round(float(np.mean(y)), 6) for car, (_, y) in found.items() if len(y)}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -49,6 +50,7 @@ MANEUVERS = StreamSchema(
     shape="object",
 )
 ATTITUDE = StreamSchema("attitude", streams.ATTITUDE)
+DATA = r'<script type="application/json" id="data">(.*)</script>'
 RADIUS_M, SPEED_M_S, RATE = 7e6, 7500.0, 7500.0 / 7e6
 
 
@@ -213,6 +215,22 @@ def test_terminal_tells_truth_measurements_control_and_estimates_apart(fly, caps
     out = capsys.readouterr().out
     places = [out.index(f"\n{word}:") for word in ("Truth", "Measurements", "Control", "Estimates")]
     assert places == sorted(places)
+
+
+def test_page_has_the_figures_that_the_terminal_speaks_of(fly, capsys, tmp_path):
+    fly(), fly(along_m=100.0, slot_error_deg=0.2)
+    page = tmp_path / "comparison.html"
+
+    assert app.run(["diff", "1", "2"]) == 0
+    assert "2 figures more with --html FILE" in capsys.readouterr().err
+    assert app.run(["diff", "1", "2", "--html", str(page)]) == 0
+
+    assert f"comparison written to {page}" in capsys.readouterr().err
+    text = page.read_text()
+    distance, believed = json.loads(re.search(DATA, text)[1])["figures"]
+    assert "<h3>Truth: distance between A and B</h3>" in text
+    assert [trace["name"] for trace in distance["choices"][0]["traces"]] == ["rms", "largest"]
+    assert [trace["name"] for trace in believed["choices"][0]["traces"]] == ["A", "B"]
 
 
 def test_attitude_and_its_negative_quaternion_are_one():

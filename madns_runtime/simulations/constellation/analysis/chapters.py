@@ -8,6 +8,7 @@ from madns_runtime.analysis.chapters import Chapter, build_sections
 from madns_runtime.analysis.tables import ComparedRun, RecordedRun, RecordedTable
 from madns_runtime.analysis.values import Block, Section, SimulationDifference
 from madns_runtime.simulations.constellation.analysis.comparison import compare_runs
+from madns_runtime.simulations.constellation.analysis.comparison_figures import comparison_figures
 from madns_runtime.simulations.constellation.analysis.comparison_tables import (
     comparison_blocks,
     to_document,
@@ -91,4 +92,5 @@ def figures(run: RecordedRun) -> list[Section]:
 def compare(a: ComparedRun, b: ComparedRun) -> SimulationDifference:
     """Return what differs between two runs."""
     found = compare_runs(a, b)
-    return SimulationDifference(document=to_document(found), blocks=comparison_blocks(found))
+    blocks = [*comparison_blocks(found), *comparison_figures(found)]
+    return SimulationDifference(document=to_document(found), blocks=blocks)
