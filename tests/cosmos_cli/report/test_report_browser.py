@@ -9,7 +9,8 @@ import pytest
 from harness.synthetic_run import T0_UTC, SyntheticRun, make_config
 
 from cosmos_cli.collect.finish import finish_run
-from cosmos_cli.report.html import write_report
+from cosmos_cli.report.html import render_sections, write_report
+from madns_runtime.analysis.values import Figure, FigureChoice, Section, Series
 from madns_runtime.recording.records import LOG, Field, StreamSchema
 
 CHROMIUM = (
@@ -151,6 +152,28 @@ def test_page_shows_what_a_run_said_and_does_nothing_of_it(hostile_page):
     assert "owned" not in told
     # In the verdict, the facts, a check, a remark, the log, a chapter's figure and its axis, versions.
     assert int(told["shown"]) >= 8
+
+
+def test_a_comparisons_figures_draw_too(tmp_path):
+    marks = [Series(x=[0.0, 1.0], y=[1.0, 2.0], name=HOSTILE)]
+    figure = Figure(title=HOSTILE, choices=[FigureChoice(marks=marks)])
+    told = {"is_same": False, "verdict": HOSTILE, "lines": [HOSTILE]}
+    page = tmp_path / "comparison.html"
+    sections = [Section(title=HOSTILE, blocks=[figure])]
+    page.write_text(render_sections("comparison.html", sections, title=HOSTILE, comparisons=[told]))
+
+    dom = browse(watched(page, tmp_path), "--dump-dom")
+
+    root = re.search(r"<html[^>]*>", dom)[0]
+    found = dict(re.findall(r'data-(\w+)="([^"]*)"', root))
+    assert (found["figures"], found["drawn"], found["failed"], found["errors"]) == (
+        "1",
+        "1",
+        "0",
+        "",
+    )
+    assert (found["requests"], found["violations"], found["scripts"]) == ("0", "0", "5")
+    assert "owned" not in found
 
 
 def test_screenshot_is_taken_of_a_page_with_content(page):
