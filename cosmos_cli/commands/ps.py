@@ -76,7 +76,7 @@ def ps(
     limit: LimitOption = None,
     all_: Annotated[
         bool, typer.Option("--all", help="A line per agent, not only their number.")
-    ] = (False),
+    ] = False,
     forks: ForksOption = FORKS_DEFAULT,
     accept_new_host_keys: AcceptHostKeysOption = False,
     json: JsonOption = False,

@@ -12,7 +12,7 @@ from cosmos_cli.report.plotly_figures import to_plotly
 from madns_runtime.analysis.breaks import gap_starts, wrap_starts
 from madns_runtime.analysis.lines import grouped_lines
 from madns_runtime.analysis.sampling import TimeEnvelope, envelope_series
-from madns_runtime.analysis.values import Axis, Figure, FigureChoice, Floats, Series
+from madns_runtime.analysis.values import Axis, Figure, FigureChoice, Floats, Form, Series
 from madns_runtime.recording.records import Field, StreamSchema
 
 ELEMENTS = StreamSchema(
@@ -158,16 +158,16 @@ def test_envelope_of_all_agents_stops_while_all_were_away() -> None:
         assert after_s == pytest.approx(60.0, abs=1.0)
 
 
-def plain(times: Floats, form: str = "line", **more: object) -> tuple[Floats, Floats]:
+def plain(times: Floats, form: Form = "line", **more: object) -> tuple[Floats, Floats]:
     """Return what is drawn of a series that somebody's own figure has as it is."""
-    mark = Series(x=times, y=times + 1.0, form=form)  # type: ignore[arg-type]
+    mark = Series(x=times, y=times + 1.0, form=form)
     made = to_plotly(Figure(title="own", choices=[FigureChoice(marks=[mark])], **more))
     ((_, (trace,)),) = made.choices
     return trace["x"], trace["y"]
 
 
 @pytest.mark.parametrize("form", ["line", "dotted", "joined points"])
-def test_line_of_somebodys_own_series_over_simulated_time_stops_at_a_gap(form: str) -> None:
+def test_line_of_somebodys_own_series_over_simulated_time_stops_at_a_gap(form: Form) -> None:
     x, y = plain(AWAY, form)
 
     assert strokes(x, y) == [(39.0, 60.0)]
