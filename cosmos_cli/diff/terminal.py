@@ -62,10 +62,15 @@ def count_figures(found: Comparison) -> int:
 
 
 def _print_blocks(console: Console, blocks: Iterable[Block], before_remark: str = "") -> None:
+    is_after_table = False
     for block in blocks:
         if isinstance(block, ReportRemark):
+            if is_after_table:
+                console.data("")
+            is_after_table = False
             console.data(f"{before_remark}{block.text}")
         elif isinstance(block, TableBlock):
+            is_after_table = True
             console.data(f"\n{block.title}" if block.title else "")
             columns = [Column(h.text, is_number=h.is_number) for h in block.headings]
             console.table(columns, [[format_cell(cell) for cell in row] for row in block.rows])

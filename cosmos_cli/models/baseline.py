@@ -8,6 +8,7 @@ expected values are written by `cosmos test --update-baselines`; names, toleranc
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,13 +19,14 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.document import Document, read_document
-from cosmos_cli.models.overrides import KEY_FORM
 from cosmos_cli.models.text_forms import NonBlank
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.yaml_source import YamlSource, read_source
 from madns_runtime.config import FORBID_EXTRA
 
 FIGURES_MAX = 1000
+_PATH_FORM = re.compile(r'[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\]|\["[^"]+"\])*')
+_PATH_STEP = re.compile(r'([^.\[\]]+)|\[([0-9]{1,9})\]|\["([^"]+)"\]')
 Statistic = Literal["count", "mean", "sd", "rms", "min", "max", "p50", "p99", "last"]
 Tolerance = Annotated[float, Ge(0), Le(1e300)]
 
@@ -36,7 +38,7 @@ class BaselineFigure:
     __pydantic_config__ = FORBID_EXTRA
 
     path: Annotated[str, Field(max_length=500)] = ""
-    """Place of the value in run.json, such as timing.ticks; empty for a recorded field."""
+    """Place of the value in run.json, such as timing.ticks or checks[0].got; empty for a recorded field."""
     stream: Annotated[str, Field(max_length=100)] = ""
     """Stream as its table is called, such as state."""
     field: Annotated[str, Field(max_length=100)] = ""
@@ -51,6 +53,11 @@ class BaselineFigure:
     """Largest difference that passes, in the field's unit."""
     relative: Tolerance = 0.0
     """Largest difference that passes, as a share of the expected value; the larger of both counts."""
+
+    @property
+    def path_steps(self) -> tuple[str, ...]:
+        """The path's keys and numbers in lists, from the outermost; a key with a dot stands in brackets and quotes."""
+        return tuple("".join(step) for step in _PATH_STEP.findall(self.path))
 
     @property
     def text(self) -> str:
@@ -134,7 +141,7 @@ def _faults(document: Document, content: BaselineContent) -> list[Fault]:
         elif not figure.path and len(of_stream) < 3:
             text = "expected path, or all of stream, field and statistic"
             faults.append(document.fault(where, text, at_key=True))
-        elif figure.path and not KEY_FORM.fullmatch(figure.path):
-            text = "expected a dotted path, such as timing.ticks or checks[0].got"
+        elif figure.path and not _PATH_FORM.fullmatch(figure.path):
+            text = 'expected a dotted path, such as timing.ticks, checks[0].got or summaries["a key"].n'
             faults.append(document.fault((*where, "path"), text))
     return faults

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, cast
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.evidence.tables import TableReader, open_tables
 from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.baseline import Baseline, BaselineFigure
-from cosmos_cli.models.overrides import parse_override
 from cosmos_cli.testing.check_lines import shown
 from madns_runtime.analysis.distribution import Distribution
 from madns_runtime.analysis.sampling import as_array
@@ -91,9 +90,7 @@ def compare_figures(
     compared = []
     for name, figure in baseline.figures.items():
         got, why_none = (
-            _at_path(document, figure.path)
-            if figure.path
-            else _of_stream(figure, tables, labels, names)
+            _at_path(document, figure) if figure.path else _of_stream(figure, tables, labels, names)
         )
         expected = figure.expected
         share = figure.relative * abs(expected) if _is_number(expected) else 0.0
@@ -113,13 +110,13 @@ def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _at_path(document: Mapping[str, Any], path: str) -> tuple[FigureValue, str]:
-    value: Any = document
-    for step in parse_override(f"{path}=")[1]:
-        if isinstance(value, list) and isinstance(step, int) and step < len(value):
+def _at_path(document: Mapping[str, Any], figure: BaselineFigure) -> tuple[FigureValue, str]:
+    path, value = figure.path, cast("Any", document)
+    for step in figure.path_steps:
+        if isinstance(value, list) and step.isdecimal() and int(step) < len(value):
+            value = value[int(step)]
+        elif isinstance(value, Mapping) and step in value:
             value = value[step]
-        elif isinstance(value, Mapping) and str(step) in value:
-            value = value[str(step)]
         else:
             return None, f"run.json has no {path}: there is no {step}"
     if isinstance(value, bool | str | int | float):

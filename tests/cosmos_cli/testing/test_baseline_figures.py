@@ -82,6 +82,27 @@ def test_what_does_not_hold_says_why(baseline, run, figure, words):
     assert words in compared.reason()
 
 
+@pytest.mark.parametrize("path", ['devices["imu.1"].read', 'devices["imu.1"]["a [b]"]', "names.0"])
+def test_a_key_with_a_dot_stands_in_brackets_and_quotes(baseline, run, path):
+    document = {"devices": {"imu.1": {"read": 7, "a [b]": 7}}, "names": [7]}
+
+    (compared,) = compare_figures(
+        baseline(f"figures: {{a: {{path: '{path}', expected: 7}}}}"), run, document
+    )
+
+    assert compared.passed
+
+
+def test_a_dot_outside_of_quotes_parts_two_keys(baseline, run):
+    (compared,) = compare_figures(
+        baseline("figures: {a: {path: devices.imu.1, expected: 7}}"),
+        run,
+        {"devices": {"imu.1": 7}},
+    )
+
+    assert "there is no imu" in compared.reason()
+
+
 @pytest.mark.parametrize("got", [math.nan, math.inf, None])
 def test_what_is_no_number_never_passes(got):
     assert not ComparedFigure(name="a", expected=1.0, got=got, allowed=1e9).passed
