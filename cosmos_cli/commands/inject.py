@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,8 +12,9 @@ import typer
 
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
-from cosmos_cli.evidence.run_directory import runs_root
+from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_search import find_run
+from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.launch.order_socket import order_action, order_fault
 from cosmos_cli.models.overrides import parse_override
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
@@ -30,7 +32,7 @@ TargetArgument = Annotated[
     str | None,
     typer.Argument(
         metavar="[TARGET]",
-        help="An agent or a glob of agents, run for the whole run, or a device's full name such as pi22/imu.",
+        help="An agent or a glob of agents, by name or second name, run for the whole run, or a device's full name such as pi22/imu.",
     ),
 ]
 ActionArgument = Annotated[
@@ -84,7 +86,8 @@ def inject(
     value: float | None = None
     parameters: dict[str, Any] = {}
     became = "in force"
-    if "/" in target:
+    second_named = _second_named(found, target)
+    if "/" in target and not second_named:
         value = _value(action, values or ())
         refusal = order_fault(found.path, found.name, (target, action, value))
     else:
@@ -92,6 +95,7 @@ def inject(
         for_s = parameters.pop(FOR_S, None)
         order = {"target": target, "action": action, "parameters": parameters, FOR_S: for_s}
         order["texts"] = _texts(values or (), parameters)
+        order["agents"] = second_named
         refusal = clean_line(str(order_action(found.path, found.name, order)["refusal"]))
         became = "begun"  # it may last for no time, and an agent may refuse its part
         if not refusal and target != WHOLE_RUN:
@@ -110,6 +114,12 @@ def inject(
         }
     )
     return int(code)
+
+
+def _second_named(run: RunDirectory, target: str) -> list[str]:
+    """Return the agents that a target finds by their second names alone: the run's host knows none."""
+    found = run_labels(run).labelled((target,))
+    return [agent for agent in found if not fnmatch.fnmatchcase(agent, target)]
 
 
 def _refuse_options(words: Sequence[str]) -> None:

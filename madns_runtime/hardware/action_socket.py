@@ -141,7 +141,7 @@ class ActionSocket:
         made = _made(kind, given)
         if faults := bound_faults(made, word):
             raise ConfigurationError("; ".join(faults))
-        agents = self._chosen(kind, target)
+        agents = self._chosen(kind, target, order.get("agents"))
         if kind is DEVICE_FAULT:
             self._check_device_fault(made)
         return OrderedAction(
@@ -165,18 +165,29 @@ class ActionSocket:
                 f"no agent knows a device {fault.device!r:.80}; there are {shown}"
             )
 
-    def _chosen(self, kind: ActionKind, target: str) -> tuple[str, ...]:
+    def _chosen(self, kind: ActionKind, target: str, others: Any) -> tuple[str, ...]:
+        """
+        Return the agents that a target finds by name, and those of *others*, whom it finds by what is not known here.
+
+        Raises:
+            ConfigurationError: There is none, or the action acts on no agents.
+        """
         if not kind.takes_agents:
             if target != WHOLE_RUN:
                 raise ConfigurationError(
                     f"{kind.word} acts on the whole run: expected {WHOLE_RUN!r}, got {target!r}"
                 )
             return ()
-        chosen = tuple(fnmatch.filter(self._agents, target))
+        found = {*fnmatch.filter(self._agents, target), *(others if _is_names(others) else ())}
+        chosen = tuple(agent for agent in self._agents if agent in found)
         if not chosen:
             shown = ", ".join(self._agents[:AGENTS_TOLD_MAX])
             raise ConfigurationError(f"no agent is named {target}; there are {shown}")
         return chosen
+
+
+def _is_names(others: Any) -> bool:
+    return isinstance(others, list) and all(isinstance(other, str) for other in others)
 
 
 def _take_texts(kind: ActionKind, given: dict[str, Any], texts: Any) -> None:

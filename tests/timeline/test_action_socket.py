@@ -106,6 +106,25 @@ def test_a_fault_of_a_device_that_no_agent_would_carry_out_is_refused(tmp_path, 
     assert len(ordered) == (not refusal)
 
 
+@pytest.mark.parametrize(
+    ("others", "chosen"),
+    [
+        (["agent-0003", "agent-0001", "nobody"], ("agent-0001", "agent-0003")),
+        (["agent-0003", 5], ()),
+        ({"agent-0003": 1}, ()),
+        ([], ()),
+    ],
+)
+def test_agents_whom_a_target_finds_by_second_names_are_named_beside_it(tmp_path, others, chosen):
+    ordered = []
+    order = {"action": "slow", "target": "IRIDIUM*", "parameters": {"factor": 2}, "agents": others}
+
+    answer = answer_to(order, tmp_path, begin=lambda action: ordered.append(action) or "")
+
+    assert [each.agents for each in ordered] == ([chosen] if chosen else [])
+    assert answer["refusal"].startswith("" if chosen else "no agent is named IRIDIUM*; there are")
+
+
 @dataclasses.dataclass(frozen=True)
 class Valve:
     """Parameters of a plug-in that was not careful: no scenario's timeline names its action."""

@@ -1,5 +1,7 @@
 """`cosmos inject`: values below zero, words that are no options, orders that have no line."""
 
+import json
+
 import pytest
 
 from cosmos_cli.commands import inject as module
@@ -42,6 +44,29 @@ def test_what_an_agent_may_yet_refuse_is_not_told_as_in_force(
     out, err = capsys.readouterr()
     assert out == f"{line}\n"
     assert ("tells so in its own events" in err) is is_carried_out_by_agents
+
+
+@pytest.mark.parametrize(
+    ("target", "agents"),
+    [
+        ("IRIDIUM 8", ["agent-02"]),
+        ("IRIDIUM*", ["agent-01", "agent-02"]),
+        ("ISS/ZARYA", ["agent-03"]),
+        ("*", []),
+        ("agent-0*", []),
+    ],
+)
+def test_agents_are_found_by_their_second_names(monkeypatch, tmp_path, ordered, target, agents):
+    names = {"agent-01": "IRIDIUM 7", "agent-02": "IRIDIUM 8", "agent-03": "ISS/ZARYA"}
+    plan = {"labels": {"column": "satellite", "names": names}}
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    orders = []
+    take = lambda path, name, order: orders.append(order) or {"refusal": ""}  # noqa: E731
+    monkeypatch.setattr(module, "order_action", take)
+
+    assert inject("last", target, "slow", "factor=2") == 0
+    assert [(order["target"], order["agents"]) for order in orders] == [(target, agents)]
+    assert not ordered
 
 
 @pytest.mark.parametrize("value", ["-5", "-0.5", "-1e-3", "-.25", "5"])
