@@ -251,7 +251,7 @@ class AgentSession:
         """Do what is due. Received datagrams must have been handed in before."""
         if self.state is AgentState.EXIT:
             return
-        self._wakefulness.called(now_s)
+        self._wakefulness.called(now_s, self.ping_due_s)
         self.link.handle_timer(now_s)
         if now_s >= self.ping_due_s:
             self._ping(now_s)
