@@ -276,6 +276,7 @@ class Hardware(Mapping[str, DevicePort]):
     def __init__(self, ports: Mapping[str, DevicePort] | None = None) -> None:
         self._ports = dict(ports or {})
         self._statuses: dict[str, DeviceStatus] = dict.fromkeys(self._ports, "never")
+        self._reports = 0
 
     def __getitem__(self, name: str) -> DevicePort:
         """
@@ -332,7 +333,7 @@ class Hardware(Mapping[str, DevicePort]):
         """
         Return what the host of a run without an operator is told: a device that was lost, and answers to orders.
 
-        The newest answers, as many as fit; sentences are cut to TOLD_BYTES_MAX.
+        Of several lost ones another with each report; the newest answers, as many as fit; sentences are cut to TOLD_BYTES_MAX.
         """
         lost = [
             (p.full_name, _cut(why)) for p in self._ports.values() if (why := p.loss) is not None
@@ -346,7 +347,8 @@ class Hardware(Mapping[str, DevicePort]):
             if left < 0:
                 break
             answers.append((number, refusal))
-        told: dict[str, Any] = {"lost_device": lost[0]} if lost else {}
+        self._reports += 1
+        told: dict[str, Any] = {"lost_device": lost[self._reports % len(lost)]} if lost else {}
         return {**told, "fault_answers": answers} if answers else told
 
     def losses(self) -> dict[str, dict[str, int]]:

@@ -154,3 +154,21 @@ def test_the_newest_answers_that_fit_a_datagram_are_told_and_none_of_a_timelines
     assert told["fault_answers"] == [(6, ""), (5, "x" * 190), (4, "x" * 190)]
     assert told["lost_device"] == ("pi22/line", "\u20ac" * 66)
     assert len(pack(told)) < 750
+
+
+def test_of_several_lost_devices_each_is_told_in_turn(device):
+    made, _ = device
+    made._page.header[page.LOSSES] = 1
+    made._page.loss.write("gone")
+    other = DevicePort(
+        "pi22/imu",
+        CHANNELS,
+        shared=(made._page, made._end),
+        limits=StatusLimits.of(0.1, 1.0),
+        now_s=lambda: 0.0,
+    )
+    both = Hardware({"line": made, "imu": other})
+
+    told = {both.report()["lost_device"] for _ in range(2)}
+
+    assert told == {("pi22/line", "gone"), ("pi22/imu", "gone")}
