@@ -31,6 +31,13 @@ PACKS_MAX: Final = 64
 """Messages of profiles that may wait for room; the oldest are given up beyond, and their points counted."""
 ANSWERS_MAX: Final = 8
 """Orders whose answers are told; who gave an older one has stopped waiting."""
+ORDERS_FROM: Final = 1_000_000
+"""Numbers of orders from here on are a timeline's: nobody waits for an answer."""
+TOLD_BYTES_MAX: Final = 200
+"""Of one sentence in a report, which goes into a datagram ..."""
+ANSWERS_BYTES_MAX: Final = 450
+"""... and of all answers in it together."""
+ANSWER_OVERHEAD_BYTES: Final = 12
 
 
 class DevicePort:
@@ -241,7 +248,8 @@ class DevicePort:
 
     def _answered(self, number: int, refusal: str) -> None:
         self._orders.discard(number)
-        self._answers.append((number, refusal))
+        if number < ORDERS_FROM:
+            self._answers.append((number, refusal))
 
     def collect(self) -> None:
         """Take what has come from the device's process into the queues; in lockstep that makes room for more."""
@@ -268,6 +276,7 @@ class Hardware(Mapping[str, DevicePort]):
     def __init__(self, ports: Mapping[str, DevicePort] | None = None) -> None:
         self._ports = dict(ports or {})
         self._statuses: dict[str, DeviceStatus] = dict.fromkeys(self._ports, "never")
+        self._reports = 0
 
     def __getitem__(self, name: str) -> DevicePort:
         """
@@ -321,10 +330,25 @@ class Hardware(Mapping[str, DevicePort]):
                 port.order_fault(order.number, order.action, value)
 
     def report(self) -> dict[str, Any]:
-        """Return what the host of a run without an operator is told: a device that was lost, and answers to orders."""
-        lost = [(p.full_name, why) for p in self._ports.values() if (why := p.loss) is not None]
-        answers = [answer for port in self._ports.values() for answer in port.answers()]
-        told: dict[str, Any] = {"lost_device": lost[0]} if lost else {}
+        """
+        Return what the host of a run without an operator is told: a device that was lost, and answers to orders.
+
+        Of several lost ones another with each report; the newest answers, as many as fit; sentences are cut to TOLD_BYTES_MAX.
+        """
+        lost = [
+            (p.full_name, _cut(why)) for p in self._ports.values() if (why := p.loss) is not None
+        ]
+        answers: list[tuple[int, str]] = []
+        left = ANSWERS_BYTES_MAX
+        every = [answer for port in self._ports.values() for answer in port.answers()]
+        for number, refusal in sorted(every, reverse=True):
+            refusal = _cut(refusal)
+            left -= len(refusal.encode()) + ANSWER_OVERHEAD_BYTES
+            if left < 0:
+                break
+            answers.append((number, refusal))
+        self._reports += 1
+        told: dict[str, Any] = {"lost_device": lost[self._reports % len(lost)]} if lost else {}
         return {**told, "fault_answers": answers} if answers else told
 
     def losses(self) -> dict[str, dict[str, int]]:
@@ -335,6 +359,10 @@ class Hardware(Mapping[str, DevicePort]):
         """Tell all devices what simulated time it is."""
         for port in self._ports.values():
             port.tell_time(local_s, t_s, rate)
+
+
+def _cut(text: str) -> str:
+    return text.encode()[:TOLD_BYTES_MAX].decode(errors="ignore")
 
 
 NO_HARDWARE: Final = Hardware()

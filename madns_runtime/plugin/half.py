@@ -33,13 +33,6 @@ from madns_runtime.protocol.messages import Service, Transmission
 from madns_runtime.reactor.forking import CAME_BACK
 from madns_runtime.timeline.action import ActionKind, ActionRefused
 
-CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
-    "initial_data": validation.initial_data,
-    "medium": validation.medium,
-    "timer": validation.next_time,
-    "finish": validation.summary,
-}
-"""Checks of what methods return, by method; values of other methods are not looked at."""
 ACTION_METHODS: Final = ("begin_action", "end_action")
 STAND_S: Final = 1e-6
 """A half that asks for times nearer to each other lets simulated time stand."""
@@ -144,6 +137,7 @@ class Half:
     """
 
     contract: type = AgentSimulation
+    checks: Mapping[str, Callable[[Any], Any]] = validation.AGENT_CHECKS
 
     def __init__(self, make: Callable[[], Any], log: Callable[[str, str], None]) -> None:
         self._log = log
@@ -178,7 +172,7 @@ class Half:
             if isinstance(error, ActionRefused) and name in ACTION_METHODS:
                 raise  # it says that it cannot, and the run goes on
             raise self.failure(name, error, function) from error
-        check = CHECKS.get(name)
+        check = self.checks.get(name)
         if check is None:
             return value
         try:
@@ -226,6 +220,7 @@ class HostHalf(Half):
     """
 
     contract = HostSimulation
+    checks = validation.HOST_CHECKS
 
     def __init__(
         self,

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 import orjson
 
 from madns_runtime.errors import PluginError
 from madns_runtime.plain_values import is_real
-from madns_runtime.protocol.codec import pack, unpack
+from madns_runtime.protocol.codec import (
+    DEPTH_MAX,
+    ITEMS_MAX,
+    UnencodableValue,
+    encode_message,
+    pack,
+    unpack,
+)
 from madns_runtime.protocol.datagram import MESSAGE_BYTES_MAX
+from madns_runtime.protocol.messages import SimulationComplete
 from madns_runtime.recording.encoding import count_not_finite
 
 SUMMARY_BYTES_MAX = 1024 * 1024
@@ -94,5 +102,34 @@ def summary(value: Any) -> dict[str, Any]:
     return plain
 
 
+def agent_summary(value: Any) -> dict[str, Any]:
+    """
+    Return the summary of an agent's half, which travels in its last message, as `summary` does.
+
+    Raises:
+        PluginError: As there; or it holds what messages do not carry.
+    """
+    plain = summary(value)
+    try:
+        encode_message(SimulationComplete({"simulation": plain}))
+    except UnencodableValue:
+        raise PluginError(
+            f"a summary that no message carries: expected lists and mappings of at most {ITEMS_MAX} items, and at most"
+            f" {DEPTH_MAX - 2} of them in each other; record long data"
+        ) from None
+    return plain
+
+
 def _kind(value: Any) -> str:
     return "None" if value is None else f"a {type(value).__name__}"
+
+
+HOST_CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
+    "initial_data": initial_data,
+    "medium": medium,
+    "timer": next_time,
+    "finish": summary,
+}
+"""Checks of what methods of a host's half return, by method; values of other methods are not looked at."""
+AGENT_CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {"finish": agent_summary}
+"""Those of an agent's half."""

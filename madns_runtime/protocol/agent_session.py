@@ -113,7 +113,7 @@ class AgentSession:
         """When to say how it is; `handle_timer` does so. The timer comes `ping_slack_s` later."""
         self._report_due_s = now_s
         self.ping_slack_s = 0.0
-        """Time in which something else, such as a tick, wakes the loop for a ping that is due."""
+        """Time in which something else, such as a tick, wakes the loop for a ping that is due; see `wait_for_ticks`."""
         self._pings_closely = PINGS_FIRST if pings.brings_clock_up else 0
         self._state_deadline_s: float | None = (
             now_s + timeouts.agents_ready_s + timeouts.host_setup_s + timeouts.agent_setup_s
@@ -136,6 +136,10 @@ class AgentSession:
     def state(self) -> AgentState:
         """Present state of this agent."""
         return self._machine.state
+
+    def wait_for_ticks(self, period_s: float) -> None:
+        """Let pings wait a little for ticks, which wake the loop with this period from now on, s."""
+        self.ping_slack_s = self._pings.slack_s(period_s)
 
     def setup_finished(self, now_s: float) -> None:
         """Take note that the agent's half is set up; the host is told once its clock is known here."""
@@ -251,7 +255,7 @@ class AgentSession:
         """Do what is due. Received datagrams must have been handed in before."""
         if self.state is AgentState.EXIT:
             return
-        self._wakefulness.called(now_s)
+        self._wakefulness.called(now_s, self.ping_due_s)
         self.link.handle_timer(now_s)
         if now_s >= self.ping_due_s:
             self._ping(now_s)

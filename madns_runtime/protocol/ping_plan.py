@@ -6,6 +6,10 @@ import math
 from dataclasses import dataclass
 
 PING_INTERVAL_S = 0.25
+PINGS_PER_SILENCE = 2.5
+"""Pings come so often at least in the time after which an agent that says nothing is lost."""
+PING_SLACK_S_MAX = 0.1
+"""For so long at most a ping waits for a tick's wake-up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,3 +38,7 @@ class PingPlan:
         return first_s + self.interval_s * max(
             0, math.ceil((now_s - first_s) / self.interval_s + 0.5)
         )
+
+    def slack_s(self, tick_period_s: float) -> float:
+        """Return for how long a ping may wait for a tick's wake-up, s, where ticks come with this period."""
+        return min(2 * tick_period_s, PING_SLACK_S_MAX, self.interval_s / 2)

@@ -9,7 +9,7 @@ from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.states import AgentState, HostState
 
 STALL_S: Final = 1.0
-"""A session that was not called for this long was itself frozen, and blames nobody for silence."""
+"""A session that was not called for this long, though it was due, was itself frozen, and blames nobody for silence."""
 
 _NEVER: Final = float("inf")
 
@@ -31,9 +31,15 @@ class Wakefulness:
         self.blameless_until_s = -_NEVER
         """Silence is counted from here at the earliest."""
 
-    def called(self, now_s: float) -> None:
-        """Take note that the session is called now."""
-        if now_s - self._called_s > STALL_S:
+    def called(self, now_s: float, wanted_s: float = -_NEVER) -> None:
+        """
+        Take note that the session is called now.
+
+        Args:
+            now_s: Present time.
+            wanted_s: When it asked to be called, at the latest: until then nothing has kept it from that.
+        """
+        if now_s - max(self._called_s, wanted_s) > STALL_S:
             self.blameless_until_s = now_s - self._silence_s / 2
         self._called_s = now_s
 

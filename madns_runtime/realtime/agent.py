@@ -44,9 +44,6 @@ from madns_runtime.recording.run_journal import RunJournal
 from madns_runtime.timing.clock import utc_at_iso
 from madns_runtime.timing.late_causes import Cause
 
-PING_SLACK_S_MAX = 0.1
-"""For so long at most a ping waits for a tick's wake-up."""
-
 
 class AgentRunner:
     """
@@ -278,7 +275,7 @@ class AgentRunner:
         self._recorder.set_t0(utc_at_iso(-now_s))
         self._journal.event("phase", phase_s=self._pack.phase_s)
         self._port.process.freeze()
-        self._session.ping_slack_s = min(2 * self._ticks.period_s, PING_SLACK_S_MAX)
+        self._session.wait_for_ticks(self._ticks.period_s)
         self._ticks.begin(now_s)
         self._pack.arm()
         self._records.begin_usage(monotonic(), self._pack.phase_s / self._ticks.period_s)

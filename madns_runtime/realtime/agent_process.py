@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from madns_runtime.config import AgentLaunch
+from madns_runtime.errors import MadnsError
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.reactor.descriptors import allow_descriptors
 from madns_runtime.reactor.operator_link import OPERATOR_SIDE_GONE
@@ -144,7 +146,14 @@ class AgentProcess:
         self._away.discard(seat.name)
         self._process.awaited -= 1
         self._lives[seat.name] += 1
-        self._runners[seat.name] = runner = self._make_runner(seat)
+        try:
+            self._runners[seat.name] = runner = self._make_runner(seat)
+        except MadnsError as error:  # the others of the process go on; the host misses it
+            reason = f"cannot return: {error}"
+            sys.stderr.write(f"{seat.name} {reason}\n")
+            self._outcomes[seat.name] = AgentOutcome(as_ordered=False, reason=reason)
+            self._stop_if_done()
+            return
         runner.start()
         runner.set_scheduling(self._grant)
 

@@ -6,13 +6,18 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any
+from typing import Any, Final
 
 from madns_runtime.hardware.port import Hardware
+from madns_runtime.protocol.codec import pack
+from madns_runtime.protocol.datagram import BEST_BYTES_MAX
 from madns_runtime.realtime.agent_link import AgentPort
 from madns_runtime.realtime.process_records import ProcessRecords
 from madns_runtime.realtime.ticks import PacedTicks
 from madns_runtime.recording.newest_values import NewestValues
+
+REPORT_BYTES_MAX: Final = BEST_BYTES_MAX - 32
+"""Of the entries of a report: the rest of a ping is its time and a few heads."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +45,7 @@ class AgentReport:
     """Scheduling that the kernel granted to the loop."""
 
     def ping(self) -> Mapping[str, Any]:
-        """Return what a ping tells of the agent."""
+        """Return what a ping tells of the agent: an entry that finds no room in its datagram is left out."""
         report = self.records.report()
         if self.port.t0_host_s is not None:
             ticks = self.ticks.pacer.summary()
@@ -51,10 +56,10 @@ class AgentReport:
                 late_p99_us=ticks["lateness_us_p99"],
                 rtf=self._real_time_factor(),
                 lost=self.port.session.link.counters.best.lost,
+                **self.devices.report(),
                 columns=self.columns.read(),
             )
-            report.update(self.devices.report())
-        return report
+        return fitting(report, REPORT_BYTES_MAX)
 
     def summary(self, simulation: Any) -> dict[str, Any]:
         """Return what the host is told at the end; *simulation* is the summary of the agent's half."""
@@ -94,6 +99,18 @@ class AgentReport:
     def _real_time_factor(self) -> float | None:
         factor = self.ticks.factor.value()
         return None if factor is None else round(factor, 9)
+
+
+def fitting(report: Mapping[str, Any], bytes_max: int) -> dict[str, Any]:
+    """Return the entries of a report that go into so many bytes, in their order: one that does not is left out."""
+    found: dict[str, Any] = {}
+    left = bytes_max
+    for name, value in report.items():
+        size = len(pack(name)) + len(pack(value))
+        if size <= left:
+            found[name] = value
+            left -= size
+    return found
 
 
 def how_ended(code: int, signal_name: str | None, reason: str | None, *, where: str) -> str:

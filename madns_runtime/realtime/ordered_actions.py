@@ -5,11 +5,12 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
-from typing import Any, Final
+from typing import Any
 
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.faults.clock_faults import FaultableClock
 from madns_runtime.hardware.fault_actions import check_fault, check_fault_fits
+from madns_runtime.hardware.port import ORDERS_FROM
 from madns_runtime.health.stress_process import (
     end_stress_processes,
     reap,
@@ -32,9 +33,6 @@ from madns_runtime.timeline.kinds import (
     DeviceFault,
     Stress,
 )
-
-ORDERS_FROM: Final = 1_000_000
-"""Numbers of fault orders from here on are a timeline's: nobody waits for an answer."""
 
 
 class OrderedActions(AgentActions):

@@ -15,7 +15,7 @@ from madns_runtime.config import AgentLaunch
 from madns_runtime.faults.clock_faults import FaultableClock
 from madns_runtime.protocol.bundle import bundle_up, is_bundle, split
 from madns_runtime.protocol.datagram import agent_index_of
-from madns_runtime.protocol.ping_plan import PING_INTERVAL_S, PingPlan
+from madns_runtime.protocol.ping_plan import PING_INTERVAL_S, PINGS_PER_SILENCE, PingPlan
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import freeze_garbage
 from madns_runtime.reactor.udp import UdpSocket
@@ -69,6 +69,7 @@ class ProcessPort:
         self.window_bytes = max(WINDOW_BYTES_MIN, share_bytes)
         """Bytes that may be on their way to each agent unread, so that all together fit the socket's buffer."""
         self._reactor = reactor
+        self._silence_s = launch.config.timeouts.silence_s
         self._made = 0
         self.awaited = 0
         """Agents of the process that have ended and will return to it."""
@@ -92,9 +93,8 @@ class ProcessPort:
     def pings(self) -> PingPlan:
         """Return when the next agent, of those that are made one after the other, exchanges times with the host."""
         number, self._made = self._made, self._made + 1
-        interval_s = PING_INTERVAL_S * min(
-            max(1.0, self.agents / PINGING_OFTEN_MAX), PING_SLOWED_MAX
-        )
+        slowed = min(max(1.0, self.agents / PINGING_OFTEN_MAX), PING_SLOWED_MAX)
+        interval_s = min(PING_INTERVAL_S * slowed, self._silence_s / PINGS_PER_SILENCE)
         return PingPlan(
             brings_clock_up=number == 0,
             delay_s=interval_s * (number + 1) / self.agents,

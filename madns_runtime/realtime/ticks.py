@@ -18,7 +18,7 @@ from madns_runtime.realtime.late_ticks import LateTicks
 from madns_runtime.realtime.loop_account import Span
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.timing.late_causes import Cause
-from madns_runtime.timing.rate import Pacer, RealTimeFactor, count_ticks
+from madns_runtime.timing.rate import Pacer, RealTimeFactor
 
 SLOWED_S_MAX = 1.0
 """The most that a fault makes a step longer, s: the loop has its process's other work to do."""
@@ -66,7 +66,6 @@ class PacedTicks:
         calls: TickCalls,
     ) -> None:
         self.period_s = 1.0 / config.agents.tick_hz
-        self._tick_hz = config.agents.tick_hz
         self.duration_s = config.time.duration_s
         """Simulated time of the run, s."""
         self.pacer = Pacer(
@@ -106,7 +105,7 @@ class PacedTicks:
         """Take simulated time *t_s* for the run's end, if it is none later, s."""
         if t_s < self.duration_s:
             self.duration_s = t_s
-            self.pacer.tick_count = min(self.pacer.tick_count, count_ticks(t_s, self._tick_hz))
+            self.pacer.end_by(t_s)
             if self.pacer.is_over and self._is_running():
                 self._calls.ended()
 

@@ -232,6 +232,11 @@ class Pacer:
         due = self._newest_due(now_s)
         return self._skip(due if self.deadline_of(due) == now_s else due + 1, "not_run")
 
+    def end_by(self, t_s: float) -> None:
+        """Run no tick at simulated time *t_s* or later, s: the run ends there; an end that is later than its own changes nothing."""
+        self.tick_count = min(self.tick_count, count_ticks(t_s, self._tick_hz))
+        self._move_to(self._index)
+
     def finish(self, now_s: float) -> None:
         """Close the account at *now_s*: whatever was due until then and never run is missed."""
         self._is_stepping = False

@@ -8,12 +8,13 @@ import pytest
 
 from madns_runtime.config import Recording
 from madns_runtime.errors import PluginError
-from madns_runtime.hardware import messages, port
+from madns_runtime.hardware import messages, page, port
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.count_table import missed_name
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort, Hardware
 from madns_runtime.hardware.status import StatusLimits
+from madns_runtime.protocol.codec import pack
 from madns_runtime.realtime.process_records import ProcessRecords
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
@@ -138,3 +139,36 @@ def test_losses_are_an_event_and_a_warning_of_the_agent(tmp_path):
 
 def lines_of(path):
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def test_the_newest_answers_that_fit_a_datagram_are_told_and_none_of_a_timelines_orders(device):
+    made, theirs = device
+    made._page.header[page.LOSSES] = 1
+    made._page.loss.write("\u20ac" * 150)
+    for number in (1, 2, 3, 4, 5, 6, 1_000_001):
+        made.order_fault(number, "bias", 1.0)
+        assert messages.send(theirs, [messages.ANSWER, number, "" if number == 6 else "x" * 190])
+
+    told = Hardware({"line": made}).report()
+
+    assert told["fault_answers"] == [(6, ""), (5, "x" * 190), (4, "x" * 190)]
+    assert told["lost_device"] == ("pi22/line", "\u20ac" * 66)
+    assert len(pack(told)) < 750
+
+
+def test_of_several_lost_devices_each_is_told_in_turn(device):
+    made, _ = device
+    made._page.header[page.LOSSES] = 1
+    made._page.loss.write("gone")
+    other = DevicePort(
+        "pi22/imu",
+        CHANNELS,
+        shared=(made._page, made._end),
+        limits=StatusLimits.of(0.1, 1.0),
+        now_s=lambda: 0.0,
+    )
+    both = Hardware({"line": made, "imu": other})
+
+    told = {both.report()["lost_device"] for _ in range(2)}
+
+    assert told == {("pi22/line", "gone"), ("pi22/imu", "gone")}

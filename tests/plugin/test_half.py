@@ -20,7 +20,13 @@ from madns_runtime.plugin import validation
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation
 from madns_runtime.plugin.executor import JobFailed
 from madns_runtime.plugin.half import Half, HalfFailed, HostHalf, RoleProgram
-from madns_runtime.protocol.messages import Delivery, Transmission, TransmissionRefusal
+from madns_runtime.protocol.codec import DEPTH_MAX, ITEMS_MAX, decode_message, encode_message
+from madns_runtime.protocol.messages import (
+    Delivery,
+    SimulationComplete,
+    Transmission,
+    TransmissionRefusal,
+)
 
 
 class Rover(AgentSimulation):
@@ -78,6 +84,11 @@ def made(kind: type, logged: list[str], half: type = Half, medium: Any = None) -
     return HostHalf(program, log, carrier=carrier)
 
 
+def nested(count: int) -> list[Any]:
+    """Return so many lists in each other."""
+    return [nested(count - 1)] if count > 1 else []
+
+
 @pytest.mark.parametrize(
     ("error", "told"),
     [
@@ -132,6 +143,38 @@ def test_a_full_disk_is_no_fault_of_the_plug_in(logged):
 def test_what_a_call_returns_against_its_contract_is_refused(logged):
     with pytest.raises(HalfFailed, match=r"^Rover\.finish returned a summary without a JSON form"):
         made(Rover, logged).call("finish")
+
+
+@pytest.mark.parametrize(
+    "summary",
+    [{"x": list(range(ITEMS_MAX + 1))}, {"x": [[]] * 3, "y": {"z": nested(DEPTH_MAX)}}],
+    ids=["long", "deep"],
+)
+def test_an_agents_summary_that_no_message_carries_is_refused_by_name(logged, summary):
+    class Long(AgentSimulation):
+        def finish(self) -> Any:
+            return summary
+
+    class LongHost(Base):
+        def finish(self) -> Any:
+            return summary
+
+    with pytest.raises(HalfFailed, match=r"^Long\.finish returned a summary .* record long data$"):
+        made(Long, logged).call("finish")
+    assert made(LongHost, logged, HostHalf).call("finish") == summary, "it travels in no message"
+
+
+def test_the_longest_and_deepest_summary_that_an_agent_may_return_fits_its_last_word(logged):
+    summary = {"x": list(range(ITEMS_MAX)), "y": nested(DEPTH_MAX - 3)}
+
+    class Long(AgentSimulation):
+        def finish(self) -> Any:
+            return summary
+
+    got = made(Long, logged).call("finish")
+
+    message = SimulationComplete({"simulation": got})
+    assert decode_message(encode_message(message)) == message
 
 
 def test_initial_data_are_those_of_the_call_whatever_the_half_does_with_them_afterwards(logged):

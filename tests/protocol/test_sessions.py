@@ -20,6 +20,7 @@ from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.protocol.link_settings import LinkSettings
 from madns_runtime.protocol.messages import Service
+from madns_runtime.protocol.ping_plan import PingPlan
 from madns_runtime.protocol.states import AgentState, HostState
 from madns_runtime.timing.clocksync import ClockEstimate
 
@@ -60,7 +61,7 @@ class World:
         self.host_is_dead = False
         self.host_sets_up = True
 
-    def join(self, name):
+    def join(self, name, pings=PingPlan()):  # noqa: B008 - frozen
         self.incarnation += 1
         self.agents[name] = AgentSession(
             AgentIdentity(
@@ -74,6 +75,7 @@ class World:
             timeouts=TIMEOUTS,
             report=lambda: {"ticks": 1},
             now_s=self.now_s,
+            pings=pings,
         )
 
     def run_for(self, seconds):

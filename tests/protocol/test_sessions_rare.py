@@ -20,6 +20,7 @@ from madns_runtime.protocol.messages import (
     SystemStop,
     Transmission,
 )
+from madns_runtime.protocol.ping_plan import PingPlan
 from madns_runtime.protocol.states import AgentState, HostState
 
 
@@ -381,3 +382,31 @@ def test_transmission_of_no_time_reaches_no_medium_and_is_counted(sent_s):
     assert heard == [h.AgentDataReceived("agent-1", good)]
     assert w.host.next_event() is None
     assert w.host.peers["agent-1"].phase is Phase.RUNNING
+
+
+def test_an_agent_that_is_called_once_per_second_misses_a_host_that_is_gone():
+    w = World(("agent-1",))
+    w.join("agent-1", PingPlan(interval_s=1.0))  # as one of many in a process
+    w.run_for(2.0)
+    session, gone_s = w.agents["agent-1"], w.now_s
+    assert session.state is AgentState.RUN_SIMULATION
+
+    for number in range(1, 10):  # each call a little later behind its time than the one before
+        called_s = session.ping_due_s + number * 1e-4
+        session.handle_timer(called_s)
+        if session.state is not AgentState.RUN_SIMULATION:
+            break
+
+    assert session.state is AgentState.EMERGENCY_SHUTDOWN
+    assert called_s - gone_s < TIMEOUTS.silence_s + 1.1
+
+
+def test_an_agent_that_was_itself_held_up_between_rare_calls_blames_nobody():
+    w = World(("agent-1",))
+    w.join("agent-1", PingPlan(interval_s=1.0))
+    w.run_for(2.0)
+    session = w.agents["agent-1"]
+
+    session.handle_timer(session.ping_due_s + 3.0)
+
+    assert session.state is AgentState.RUN_SIMULATION

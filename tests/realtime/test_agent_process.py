@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from madns_runtime.config import Agents
-from madns_runtime.plugin.half import RoleProgram
+from madns_runtime.plugin.half import HalfFailed, RoleProgram
 from madns_runtime.protocol.events import ClockEstimated
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.realtime import agent_process
@@ -42,6 +42,42 @@ def test_an_agent_that_returns_is_given_what_its_conditions_had_counted(monkeypa
         process._ended("a", AgentOutcome(as_ordered=False, reason="on purpose"))
 
     assert given == [(1, {}), (2, {3: 10}), (3, {3: 20})]
+
+
+def test_an_agent_that_cannot_be_made_again_leaves_the_others_of_its_process_alone(monkeypatch):
+    made = []
+
+    def make(seat, launch, program, **more):
+        made.append(seat.name)
+        if made.count(seat.name) > 1:
+            raise HalfFailed("Rover.__init__ raised ValueError: no link")
+        return SimpleNamespace(counted=dict)
+
+    monkeypatch.setattr(agent_process, "AgentRunner", make)
+    stops = []
+    reactor = SimpleNamespace(
+        now_s=lambda: 0.0,
+        call_at=lambda due_s, call: call(),
+        end_if_forked=lambda: None,
+        stop=lambda: stops.append(True),
+    )
+    seats = [SimpleNamespace(name="a"), SimpleNamespace(name="b")]
+    program = RoleProgram(make=object, parameters=None)
+    monkeypatch.setattr(agent_process, "Reactor", lambda: reactor)
+    process = AgentProcess(None, seats, program, life_fd=-1, tell_killed=lambda *told: None)
+    process._process = SimpleNamespace(awaited=0, close_if_unused=lambda: None)
+    process._packs = dict.fromkeys("ab")
+    process._runners = {seat.name: process._make_runner(seat) for seat in seats}
+
+    process._dropped["a"] = 0.5
+    process._ended("a", AgentOutcome(as_ordered=False, reason="on purpose"))
+
+    outcome = process._outcomes["a"]
+    assert outcome.reason == "cannot return: Rover.__init__ raised ValueError: no link"
+    assert (outcome.as_ordered, outcome.may_restart) == (False, False)
+    assert (list(process._runners), stops, process._process.awaited) == (["b"], [], 0)
+    process._ended("b", AgentOutcome(as_ordered=True))
+    assert stops == [True]
 
 
 def test_every_pack_of_a_process_is_timed_anew_with_the_clock_that_they_share(monkeypatch):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from madns_runtime.config import Recording
+from madns_runtime.config import Recording, Timeouts
 from madns_runtime.protocol.bundle import BUNDLE, bundle_up, split
 from madns_runtime.protocol.datagram import OVERHEAD_BYTES
 from madns_runtime.realtime.process_port import MOVED_S, PING_INTERVAL_S, ProcessPort
@@ -41,11 +41,11 @@ def host():
         yield handle
 
 
-def port_of(host, agents, loop=None):
+def port_of(host, agents, loop=None, silence_s=2.5):
     launch = SimpleNamespace(
         host_address="127.0.0.1",
         host_port=host.getsockname()[1],
-        config=SimpleNamespace(recording=Recording()),
+        config=SimpleNamespace(recording=Recording(), timeouts=Timeouts(silence_s=silence_s)),
     )
     return ProcessPort(launch, loop or Loop(), agents)
 
@@ -221,3 +221,15 @@ def test_one_agent_brings_the_clock_up_and_many_ping_more_rarely(host):
     assert {plan.interval_s for plan in plans} == {4 * PING_INTERVAL_S}
     assert sorted({plan.delay_s for plan in plans}) == [plan.delay_s for plan in plans]
     assert port_of(host, 1).pings().interval_s == PING_INTERVAL_S
+
+
+@pytest.mark.parametrize("agents", [1, 8, 64])
+@pytest.mark.parametrize("silence_s", [0.21, 0.5, 1.0, 2.5])
+def test_no_agent_is_silent_for_as_long_as_makes_it_lost(host, agents, silence_s):
+    port = port_of(host, agents, silence_s=silence_s)
+    plan = [port.pings() for _ in range(agents)][-1]
+    slack_s = plan.slack_s(tick_period_s=1.0)
+
+    longest_s = max(plan.next_s(0.0, at_s / 100) - at_s / 100 for at_s in range(1000)) + slack_s
+
+    assert longest_s < 0.81 * silence_s

@@ -422,3 +422,25 @@ def test_real_time_factor_spans_the_first_to_the_last_tick():
     factor.add(5.0, 101.0)
     factor.add(12.0, 105.0)
     assert factor.value() == 2.0
+
+
+def test_no_tick_is_run_behind_an_end_that_is_ordered_in_the_last_ones_period():
+    pacer = make_pacer(tick_hz=1.0, duration_s=60.0)
+    for index in range(5):
+        run_tick(pacer, index + 0.001, index + 0.002)
+
+    pacer.end_by(5.0)  # ordered at 4.1 s, say
+
+    assert pacer.is_over
+    assert pacer.next_deadline_s() is None
+    assert pacer.begin(5.0) is None
+    pacer.finish(7.0)
+    assert pacer.summary()["due"] == pacer.summary()["run"] == 5
+
+
+def test_a_later_end_than_the_runs_own_changes_nothing():
+    pacer = make_pacer(tick_hz=1.0, duration_s=2.0)
+
+    pacer.end_by(5.0)
+
+    assert pacer.tick_count == 2
