@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from madns_runtime.timeline import runner as runner_module
 from madns_runtime.timeline.action import ActionKind, TimelineAction
 from madns_runtime.timeline.dispatcher import Dispatcher
 from madns_runtime.timeline.entries import ScheduledEntry
@@ -126,6 +127,18 @@ def test_a_condition_begins_what_waits_for_it_and_the_delay_is_recorded() -> Non
 
     assert handler.calls == [("begin", "kill", 7.0), ("end", "kill", 7.0)]
     assert [each["delay_s"] for each in events] == [0.5, 0.0]
+
+
+def test_live_orders_leave_what_waits_for_a_condition_its_room(monkeypatch) -> None:
+    monkeypatch.setattr(runner_module, "ORDERS_MAX", 2)
+    runner, handler, _ = a_runner(ScheduledEntry(action="kill", agents=("a",), condition=0))
+    live = OrderedAction(word="annotate", parameters={})
+
+    answers = [runner.order(live, t_s) for t_s in (1.0, 2.0, 3.0)]
+    runner.met(0, met_s=4.0, now_s=4.0)
+
+    assert answers == ["", "", "at most 2 actions may be ordered in one run"]
+    assert handler.calls[-1] == ("begin", "kill", 4.0)
 
 
 def test_orders_take_place_at_once() -> None:
