@@ -139,14 +139,15 @@ class TimelineRunner:
         self._is_closed = True
 
     def met(self, condition: int, met_s: float, now_s: float) -> None:
-        """Begin, now, the actions that wait for a condition, which was met at *met_s*; the first time alone."""
+        """Begin, now, the actions that wait for a condition, which was met at *met_s*, as its record says; the first time alone."""
         if condition in self._met:
             return
         self._met.add(condition)
+        due_s = met_s if met_s < now_s else now_s  # a record may bear a time to come, or none
         for place, entry in enumerate(self._entries):
             if entry.condition == condition and not self._is_closed:
                 ordered = OrderedAction.of_entry(place, entry, entry.agents)
-                self._begin(ordered, met_s, now_s)
+                self._begin(ordered, due_s, now_s)
 
     def order(self, ordered: OrderedAction, now_s: float) -> str:
         """Begin an action that is ordered live, at simulated time *now_s*, s; return why it is refused, "" if it takes place."""

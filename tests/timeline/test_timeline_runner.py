@@ -1,6 +1,9 @@
 """A timeline while its run goes on, by simulated times alone."""
 
+import math
 from typing import Any
+
+import pytest
 
 from madns_runtime.timeline import runner as runner_module
 from madns_runtime.timeline.action import ActionKind, TimelineAction
@@ -127,6 +130,20 @@ def test_a_condition_begins_what_waits_for_it_and_the_delay_is_recorded() -> Non
 
     assert handler.calls == [("begin", "kill", 7.0), ("end", "kill", 7.0)]
     assert [each["delay_s"] for each in events] == [0.5, 0.0]
+
+
+@pytest.mark.parametrize("met_s", [math.nan, math.inf, 50.0])
+def test_what_a_condition_begins_ends_whatever_time_the_record_bears(met_s) -> None:
+    runner, handler, events = a_runner(
+        ScheduledEntry(action="kill", condition=3, for_s=2.0, agents=("a",)),
+    )
+
+    runner.met(3, met_s=met_s, now_s=7.5)
+    assert runner.next_s == 9.5
+    runner.run_due(9.5)
+
+    assert handler.calls == [("begin", "kill", 7.5), ("end", "kill", 7.5)]
+    assert [(each["due_s"], each["delay_s"]) for each in events] == [(7.5, 0.0), (9.5, 0.0)]
 
 
 def test_live_orders_leave_what_waits_for_a_condition_its_room(monkeypatch) -> None:
