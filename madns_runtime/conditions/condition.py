@@ -124,6 +124,11 @@ class Condition:
     ends_run: bool = False
     """Whether the run ends when it is met: an expectation is broken."""
 
+    @property
+    def is_timed(self) -> bool:
+        """Whether records count at some times alone."""
+        return self.from_s is not None or self.to_s is not None
+
     def is_at(self, t_s: float | None) -> bool:
         """Tell whether a record of simulated time *t_s* counts; None, before it runs, counts as 0."""
         if t_s is None or math.isnan(t_s):

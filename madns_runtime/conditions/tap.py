@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -141,10 +142,13 @@ class ConditionTap:
         t_s: float | None,
         read: Callable[[str], Any],
     ) -> None:
+        is_timeless = t_s is not None and not math.isfinite(t_s)
         for evaluator in following:
-            field = evaluator.condition.field
-            value = read(field) if field else 1.0
-            self._note(who, evaluator, evaluator.take(t_s, value))
+            condition = evaluator.condition
+            value = read(condition.field) if condition.field else 1.0
+            # On record such a time is null, which counts as 0 where a condition, and who judges the run, looks at times.
+            own_s = (None if condition.is_timed else self._now_s()) if is_timeless else t_s
+            self._note(who, evaluator, evaluator.take(own_s, value))
 
     def _note(self, who: str, evaluator: ConditionEvaluator, met_s: float | None) -> None:
         if met_s is not None:

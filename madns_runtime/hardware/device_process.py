@@ -30,7 +30,7 @@ RECORDS_TIMEOUT_S = 2.0
 ERROR_CHARACTERS_MAX = 500
 """Of what a driver raised, so much is told; all of it is recorded."""
 REPORT, GONE = "report", "gone"
-"""First words to the manager: [REPORT, counts by device] at the end, [GONE, why] before where nobody said stop."""
+"""First words to the manager: [REPORT, counts by device] at the end, in as many messages as it takes; [GONE, why] before where nobody said stop."""
 
 
 def run_devices(
@@ -50,7 +50,8 @@ def run_devices(
         users = {end.fileno() for seat in seats for end in seat.users.values()}
         leave_parent(keep={control.fileno(), *users})
         report = DeviceLoop(seats, control, config, directory).run()
-        messages.send(control, [REPORT, report])
+        for part in messages.in_parts(REPORT, report):
+            messages.send(control, part)
         code = 0
     except BaseException as error:  # noqa: BLE001 - the last frame of a process
         messages.send(control, [GONE, str(error) if isinstance(error, MadnsError) else said(error)])

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import socket
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware import messages, page
+from madns_runtime.hardware.contract import Device
 from madns_runtime.hardware.count_table import NOT_FINITE
 from madns_runtime.hardware.fault_actions import DISCONNECTED, check_fault_fits
 from madns_runtime.hardware.intake import counts_of, silent_inputs
@@ -74,6 +75,23 @@ class DrivenDevice:
     def name(self) -> str:
         """Full name of the device, such as pi22/imu."""
         return self.seat.launch.full_name
+
+    @property
+    def has_moving_outputs(self) -> bool:
+        """Whether it has outputs that may move."""
+        is_out = (channel.direction == "out" for channel in self.seat.channels)
+        return self.seat.launch.may_move and any(is_out)
+
+    def alter(self, alter: Callable[[Device], None]) -> None:
+        """Have each driver of it altered when it is made."""
+        make = self.seat.make
+
+        def make_altered() -> Device:
+            made = make()
+            alter(made)
+            return made
+
+        self.seat = replace(self.seat, make=make_altered)
 
     def refusal_of(self, action: str) -> str:
         """Return why a fault cannot be inserted around it; empty if it can."""

@@ -103,7 +103,7 @@ class Guardian:
             if word == DRIVES:
                 self._drivers[name] = pid
                 self._attempts.pop(name, None)
-                self._reactor.call_at(monotonic() + STAND_BY_S, partial(self._stand_by, name))
+                self._reactor.call_at(monotonic() + STAND_BY_S, partial(self._prepare, name))
                 self._watch(pid, partial(self._driver_ended, name, pid))
             elif word == WATCH:
                 self._watch(pid, partial(self._owner_ended, name))
@@ -174,27 +174,39 @@ class Guardian:
     # What is done -------------------------------------------------------------------------------
 
     def _make_safe(self, name: str) -> None:
-        """Open a device anew in a process of its own, for `make_safe` alone."""
+        """Open a device anew in a process of its own, for `make_safe` alone; where there is no room for it, a little later."""
+        if not self._stand_by(name):
+            self._retries += 1
+            self._reactor.call_at(monotonic() + RETRY_S, partial(self._make_safe_again, name))
+            return
         self._attempts[name] = self._attempts.get(name, 0) + 1
         header = self._seats[name].page.header
         header[page.ATTEMPTED] = header[page.MOVED]
-        self._stand_by(name)
         pid, line = self._standing_by.pop(name)
         self._helpers[pid] = name, line
         with contextlib.suppress(OSError):  # its end is seen by itself
             line.send(b"!")
         self._reactor.call_at(monotonic() + ATTEMPT_S, lambda: self._give_up(pid))
 
-    def _stand_by(self, name: str) -> None:
-        """Have a process ready that has imported the driver, if there is none."""
+    def _prepare(self, name: str) -> None:
+        """Have a process stand by for a device that is driven, as soon as there is room for it."""
+        if name in self._drivers and not self._stand_by(name):
+            self._reactor.call_at(monotonic() + STAND_BY_S, partial(self._prepare, name))
+
+    def _stand_by(self, name: str) -> bool:
+        """Have a process ready that has imported the driver, if there is none; return whether there is one."""
         if name in self._standing_by:
-            return
-        line, child_line = socket.socketpair()
-        pid = os.fork()
+            return True
+        try:
+            line, child_line = socket.socketpair()
+            pid = os.fork()
+        except OSError:  # out of descriptors, processes or memory, which may be over in a moment
+            return False
         if pid == 0:
             _open_and_make_safe(self._seats[name], child_line)
         child_line.close()
         self._standing_by[name] = pid, line
+        return True
 
     def _make_safe_again(self, name: str) -> None:
         self._retries -= 1

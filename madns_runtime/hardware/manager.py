@@ -10,13 +10,13 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, Final
 
 from madns_runtime.config import AgentLaunch
+from madns_runtime.errors import MachineError
 from madns_runtime.hardware import guardian, messages, page
 from madns_runtime.hardware.child_process import fork_with_pair, kill, wait_for
 from madns_runtime.hardware.claims import DeviceClaims
@@ -48,6 +48,8 @@ OPENING_POLL_S: Final = 0.005
 END_S: Final = 3.0
 """For the devices' processes to end in good order: making safe, and their records."""
 KILL_WAIT_S: Final = 1.0
+NO_ROOM_S: Final = 0.5
+"""Between two attempts to start a process for which the machine has no room."""
 
 Emit = Callable[[Mapping[str, Any]], None]
 
@@ -84,12 +86,7 @@ class DeviceManager:
         if shared:
             self._processes.append(DeviceProcess(shared))
         tell("")
-        self._guarded = {
-            name: driven.seat
-            for name, driven in self._devices.items()
-            if driven.seat.launch.may_move
-            and any(channel.direction == "out" for channel in driven.seat.channels)
-        }
+        self._guarded = {name: d.seat for name, d in self._devices.items() if d.has_moving_outputs}
         self._owners: dict[str, int] = {}
         """Processes of the agents that own outputs."""
         self._guardian: socket.socket | None = None
@@ -139,17 +136,9 @@ class DeviceManager:
 
     def alter(self, device: str, alter: Callable[[Device], None]) -> None:
         """Have each driver of a device altered when it is made, as a verification does; before `start`."""
-        driven = self._devices[device]
-        make = driven.seat.make
-
-        def make_altered() -> Device:
-            made = make()
-            alter(made)
-            return made
-
-        driven.seat = replace(driven.seat, make=make_altered)
+        self._devices[device].alter(alter)
         if device in self._guarded:
-            self._guarded[device] = driven.seat
+            self._guarded[device] = self._devices[device].seat
 
     def page_of(self, device: str) -> DevicePage:
         """Return the page of a device by its full name."""
@@ -306,12 +295,22 @@ class DeviceManager:
         process.failures = 0 if monotonic() - process.started_s > 10.0 else process.failures + 1
         for driven in process.devices:
             driven.restarts += 1
-        due_s = monotonic() + back_off_s(process.failures)
-        self._reactor.call_at(due_s, lambda: self._restart(process))
+        names = ", ".join(driven.name for driven in process.devices)
+        start = partial(self._start_anew, names, lambda: self._start(process))
+        self._reactor.call_at(monotonic() + back_off_s(process.failures), start)
 
-    def _restart(self, process: DeviceProcess) -> None:
-        if not self._is_ending and not process.pid:
-            self._start(process)
+    def _start_anew(self, what: str, start: Callable[[], None], *, is_told: bool = False) -> None:
+        """Start a process as soon as the machine has room for it, as long as the run goes on; say once why that has to wait."""
+        if self._is_ending or self._reactor is None:
+            return
+        try:
+            start()
+        except MachineError as error:  # such as of memory: what else the machine runs goes on
+            text = f"{what}: {error}; it is tried again"
+            if not is_told:
+                self._emit({"event": "log", "level": "error", "text": text})
+            again = partial(self._start_anew, what, start, is_told=True)
+            self._reactor.call_at(monotonic() + NO_ROOM_S, again)
 
     def _guardian_ended(self) -> None:
         self._guardian_pid = 0
@@ -320,7 +319,8 @@ class DeviceManager:
         if self._guardian is not None:
             self._reactor.remove_reader(self._guardian.fileno())
             self._guardian.close()
-        self._start_guardian()
+            self._guardian = None
+        self._start_anew("outputs are not guarded", self._start_guardian)
 
     # Statuses -----------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ Nobody waits: who finds the other's buffer full keeps the newest for later, or c
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import msgpack
@@ -16,6 +16,8 @@ from madns_runtime.errors import MachineError
 
 BYTES_MAX: Final = 65_536
 BUFFER_BYTES: Final = 262_144
+MAP_HEAD_BYTES: Final = 4
+"""By which the head of a mapping of many entries is longer than that of an empty one."""
 DATAGRAMS_MAX: Final = 4096
 """Of one look: more wait for the next, so that a flood holds nobody."""
 
@@ -55,6 +57,21 @@ def send(end: socket.socket, message: list[Any]) -> bool:
     except (BlockingIOError, ConnectionError, OSError):
         return False
     return True
+
+
+def in_parts(word: str, told: Mapping[str, Any]) -> Iterator[list[Any]]:
+    """Yield messages [word, part of *told*] that hold all of it; each is received whole if no entry alone is too long for that."""
+    part: dict[str, Any] = {}
+    size_bytes = empty_bytes = len(msgpack.packb([word, part])) + MAP_HEAD_BYTES
+    for name, value in told.items():
+        entry_bytes = len(msgpack.packb(name)) + len(msgpack.packb(value))
+        if part and size_bytes + entry_bytes > BYTES_MAX:
+            yield [word, part]
+            part, size_bytes = {}, empty_bytes
+        part[name] = value
+        size_bytes += entry_bytes
+    if part:
+        yield [word, part]
 
 
 def receive_all(end: socket.socket) -> Iterator[list[Any]]:

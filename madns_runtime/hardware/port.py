@@ -14,7 +14,7 @@ from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Channel, Value
 from madns_runtime.hardware.count_table import missed_name
 from madns_runtime.hardware.page import DevicePage
-from madns_runtime.hardware.profiles import pack_points
+from madns_runtime.hardware.profiles import pack_points, packs_max
 from madns_runtime.hardware.status import StatusLimits
 from madns_runtime.hardware.values import are_finite, from_numbers, to_frame, to_numbers
 from madns_runtime.plugin.device_view import (
@@ -28,7 +28,8 @@ from madns_runtime.protocol.messages import FaultOrder
 FRAMES_MAX: Final = 10_000
 """Values of a queue that may wait to be taken; the oldest are given up beyond, and counted."""
 PACKS_MAX: Final = 64
-"""Messages of profiles that may wait for room; the oldest are given up beyond, and their points counted."""
+"""Messages of profiles that may wait for room, or as many as one profile of the widest output takes; the oldest are given up
+beyond, and their points counted."""
 ANSWERS_MAX: Final = 8
 """Orders whose answers are told; who gave an older one has stopped waiting."""
 ORDERS_FROM: Final = 1_000_000
@@ -87,6 +88,8 @@ class DevicePort:
         self._unsent: dict[str, list[Any]] = {}
         self._packs: deque[list[Any]] = deque()
         """Points of profiles that wait for room."""
+        played = (c for c in channels if c.direction == "out" and not c.is_frame)
+        self._packs_max = max((PACKS_MAX, *map(packs_max, played)))
         self.frames_dropped = 0
         """Values of queues that nobody took in time."""
         self.writes_lost = 0
@@ -181,9 +184,11 @@ class DevicePort:
         for number, pack in enumerate(packs):
             first_s = pack[0] if number else start_s
             self._packs.append([messages.PLAY, channel, first_s, pack.tobytes()])
-        while len(self._packs) > PACKS_MAX:
-            self.points_lost += self._count_points(self._packs.popleft())
         self.flush()
+        if len(self._packs) > self._packs_max:
+            self.make_room()
+        while len(self._packs) > self._packs_max:
+            self.points_lost += self._count_points(self._packs.popleft())
 
     def _count_points(self, pack: list[Any]) -> int:
         return len(pack[-1]) // 8 // (self.channels[pack[1]].size + 1)

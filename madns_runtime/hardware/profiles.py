@@ -66,6 +66,16 @@ def counts_by_channel(counts: Mapping[str, int]) -> dict[str, dict[str, int]]:
     return found
 
 
+def packs_max(channel: Channel) -> int:
+    """Return how many messages POINTS_MAX points of an output take."""
+    return -(-POINTS_MAX // _points_each(channel))
+
+
+def _points_each(channel: Channel) -> int:
+    """Return how many points of an output one message holds."""
+    return max(1, min(POINTS_EACH_MAX, NUMBERS_EACH_MAX // (channel.size + 1)))
+
+
 def pack_points(channel: Channel, points: Iterable[tuple[float, Any]]) -> list[array[float]]:
     """
     Return points as rows of time and numbers, in messages of a bounded size.
@@ -74,7 +84,7 @@ def pack_points(channel: Channel, points: Iterable[tuple[float, Any]]) -> list[a
         PluginError: Times do not rise, a value is none of the channel's shape, or there are more than POINTS_MAX.
     """
     width = channel.size + 1
-    each_max = max(1, min(POINTS_EACH_MAX, NUMBERS_EACH_MAX // width)) * width
+    each_max = _points_each(channel) * width
     packs: list[array[float]] = [array("d")]
     last_s, count = -math.inf, 0
     for t_s, value in points:

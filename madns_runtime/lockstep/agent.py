@@ -63,7 +63,7 @@ class LockstepAgent:
 
     Raises:
         MachineError: It cannot record.
-        HalfFailed: Its half cannot be made.
+        HalfFailed: Its half cannot be made, of the first incarnation: that of a later one is made by `begin`.
     """
 
     def __init__(
@@ -96,8 +96,9 @@ class LockstepAgent:
             life=life,
         )
         self.columns = NewestValues(self.journal.recorder, mates.program.columns)
-        self.half = Half(mates.program.make, self.journal.say)
-        self.step = self.half.simulation.step
+        self._mates = mates
+        self.is_made = False
+        """Whether its half is made."""
         self.stepping = index * POSITIONS + STEPPING
         self.is_running = False
         self.deadlines_broken = 0
@@ -116,13 +117,6 @@ class LockstepAgent:
             clock=mates.clock,
         )
         self.has_devices = bool(self.devices)
-        self.actions = AgentActions(
-            self.name,
-            mates.program.actions,
-            call=self.half.call,
-            journal=self.journal,
-            own={DEVICE_FAULT.word: self.devices.take_fault},
-        )
         self.context = PeerContext(
             name=self.name,
             config=mates.config,
@@ -133,6 +127,38 @@ class LockstepAgent:
             mailbox=self.mailbox,
             hardware=self.devices.hardware,
         )
+        if life == 1:
+            self._make_half()
+
+    def _make_half(self) -> None:
+        program = self._mates.program
+        self.half = Half(program.make, self.journal.say)
+        self.step = self.half.simulation.step
+        self.actions = AgentActions(
+            self.name,
+            program.actions,
+            call=self.half.call,
+            journal=self.journal,
+            own={DEVICE_FAULT.word: self.devices.take_fault},
+        )
+        self.is_made = True
+
+    def begin(self, has_devices: bool) -> None:
+        """
+        Open its devices unless *has_devices*, those of an earlier incarnation, and make the half of a later one.
+
+        Raises:
+            PluginError: A driver raised, or the half cannot be made; the text says where.
+        """
+        if not has_devices:
+            self.devices.open()
+        if not self.is_made:
+            self._make_half()
+
+    def abandon(self) -> None:
+        """Have its half, if it was made, let go of what it has started."""
+        if self.is_made:
+            self.half.abandon()
 
     def send(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Callable
 
 from madns_runtime.lockstep.frames import (
     ABANDONING,
@@ -14,7 +15,6 @@ from madns_runtime.lockstep.frames import (
     encode_frame,
 )
 from madns_runtime.lockstep.worker_line import HostGone, WorkerLine
-from madns_runtime.plugin.half import Half
 from madns_runtime.reactor.forking import CAME_BACK, ForkedCopies, end_child
 
 WAIT_S = 1.0
@@ -57,10 +57,10 @@ class StrayForks:
             line.say(encode_frame(FAILED, index, f"the agent's {method} {CAME_BACK}"))
         end_child(1)
 
-    def abandon(self, index: int, half: Half, line: WorkerLine) -> None:
+    def abandon(self, index: int, abandon: Callable[[], None], line: WorkerLine) -> None:
         """Have an agent's half let go of what it has started, and end a process that it forks where it comes back."""
         self._position[0] = index * POSITIONS + ABANDONING
-        half.abandon()
+        abandon()
         self.end_stray(line)
         self._position[0] = index * POSITIONS + CLOSING
 

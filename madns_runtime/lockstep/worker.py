@@ -180,8 +180,7 @@ class Worker:
         self._position[0] = agent.index * POSITIONS + frames.SETTING_UP
         agent.journal.event("start")
         try:
-            if not has_devices:
-                self._ask(agent, agent.devices.open)
+            self._ask(agent, agent.begin, has_devices)
             self._call(agent, "setup", agent.context, unpack(packed))
         except AgentFailed as failure:
             self._lose(agent, failure)
@@ -316,7 +315,7 @@ class Worker:
         self._forks.end_stray(self._line)
         if not self._goes_on:
             raise failure
-        self._forks.abandon(agent.index, agent.half, self._line)
+        self._forks.abandon(agent.index, agent.abandon, self._line)
         self._agents = [other for other in self._agents if other is not agent]
         self._faults.pop(agent.index, None)
         self._losses.add(agent, clean_text(failure.reason))
@@ -384,7 +383,7 @@ class Worker:
             if reason is not None:
                 agent.journal.event("emergency", reason=reason)
                 agent.journal.say("critical", f"emergency shutdown: {reason}")
-                self._forks.abandon(agent.index, agent.half, self._line)
+                self._forks.abandon(agent.index, agent.abandon, self._line)
             losses = agent.journal.device_losses(agent.devices.hardware.losses())
             counts = {**losses, **agent.journal.close().to_mapping()}
             if agent.devices:

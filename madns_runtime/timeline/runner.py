@@ -15,7 +15,7 @@ from madns_runtime.timeline.schedule import DueAction, schedule
 from madns_runtime.written_times import later_s
 
 ORDERS_MAX: Final = 10_000
-"""Actions of one run that conditions begin or that are ordered live; more are refused."""
+"""Actions of one run that are ordered live; more are refused."""
 
 
 TIMES_BITS: Final = 32
@@ -139,30 +139,24 @@ class TimelineRunner:
         self._is_closed = True
 
     def met(self, condition: int, met_s: float, now_s: float) -> None:
-        """Begin, now, the actions that wait for a condition, which was met at *met_s*; the first time alone."""
+        """Begin, now, the actions that wait for a condition, which was met at *met_s*, as its record says; the first time alone."""
         if condition in self._met:
             return
         self._met.add(condition)
+        due_s = met_s if met_s < now_s else now_s  # a record may bear a time to come, or none
         for place, entry in enumerate(self._entries):
-            if entry.condition == condition:
+            if entry.condition == condition and not self._is_closed:
                 ordered = OrderedAction.of_entry(place, entry, entry.agents)
-                self.order(ordered, now_s, due_s=met_s)
+                self._begin(ordered, due_s, now_s)
 
-    def order(self, ordered: OrderedAction, now_s: float, *, due_s: float | None = None) -> str:
-        """
-        Begin an action now; return why it is refused, "" if it takes place.
-
-        Args:
-            ordered: What.
-            now_s: Simulated time, s.
-            due_s: When it should have begun; None for now.
-        """
+    def order(self, ordered: OrderedAction, now_s: float) -> str:
+        """Begin an action that is ordered live, at simulated time *now_s*, s; return why it is refused, "" if it takes place."""
         if self._is_closed:
             return "the run is ending"
         if self._ordered_count >= ORDERS_MAX:
             return f"at most {ORDERS_MAX} actions may be ordered in one run"
         self._ordered_count += 1
-        return self._begin(ordered, now_s if due_s is None else due_s, now_s)
+        return self._begin(ordered, now_s, now_s)
 
     def _begin(
         self, ordered: OrderedAction, due_s: float, now_s: float, *, is_known: bool = False

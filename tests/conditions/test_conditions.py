@@ -1,6 +1,7 @@
 """Conditions: bounds, when one is met, what a tap hands to whom, and what the host does with word of it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,6 +105,22 @@ def test_a_tap_takes_a_records_own_time_from_t_s_or_its_tick_or_the_clock():
 
     assert told == [(1, "a", 2.5), (2, "a", 7.5), (3, "a", 99.0)]
     assert tap.open("other", ("tick", "speed_m_s")) is None
+
+
+@pytest.mark.parametrize("t_s", [math.nan, math.inf, -math.inf])
+def test_a_record_whose_time_is_none_is_of_the_present_and_where_times_count_of_none(t_s):
+    timed = condition(number=1, from_s=50.0)
+    lasting = condition(number=2, for_s=5.0)
+    tap, told = tapped(
+        (condition(stream="s"), *(replace(each, stream="s") for each in (timed, lasting)))
+    )
+    take = tap.open("s", ("t_s", "speed_m_s"))
+
+    take((t_s, 11.0))
+    tap.look(103.9)
+    assert told == [(0, "a", 99.0)]
+    tap.look(104.0)
+    assert told == [(0, "a", 99.0), (2, "a", 104.0)]
 
 
 def test_a_hosts_records_that_name_agents_are_followed_agent_by_agent():

@@ -11,7 +11,7 @@ import pytest
 
 from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
-from madns_runtime.hardware import guardian, manager, page
+from madns_runtime.hardware import guardian, manager, messages, page
 from madns_runtime.hardware.guardian import ATTEMPTS_MAX
 from tests.hardware import bench as bench_module
 from tests.hardware.bench import AGENT, DeviceBench, line_bench
@@ -318,6 +318,28 @@ def test_counts_survive_the_process_that_counted(tmp_path):
     assert report["valve_limited"] == 1
     assert report["samples"] == result["samples"] > 0
     assert report["unreported"] == 1  # its records have no end
+
+
+def test_devices_of_one_process_are_all_reported_where_one_message_does_not_hold_it(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(messages, "BYTES_MAX", 1000)  # two reports
+    devices = tuple(
+        DeviceLaunch(
+            name=f"clock{number}",
+            place="pi22",
+            kind="null",
+            base_directory=str(tmp_path),
+            rate_hz=10.0,
+            users=(AGENT,),
+        )
+        for number in range(5)
+    )
+    bench = DeviceBench(tmp_path, devices)
+    result = bench.close()
+
+    assert len(result) == 5
+    assert [each["report"].get("unreported") for each in result.values()] == [None] * 5
 
 
 def stand_still(bench):

@@ -33,3 +33,18 @@ def test_the_last_words_of_one_that_ended_without_reading_what_it_was_told_are_h
 
     assert list(messages.receive_all(own)) == [["report", {}]]
     assert messages.is_over(own)
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 1000])
+def test_a_mapping_that_is_told_in_parts_is_received_whole(pair, count):
+    own, other = pair
+    told = {f"pi22/clock{number}": {"records": "x" * (number % 300)} for number in range(count)}
+    for part in messages.in_parts("report", told):
+        assert messages.send(other, part)
+
+    heard = {}
+    for word, part in messages.receive_all(own):
+        assert word == "report"
+        heard |= part
+    assert heard == told
+    assert list(messages.in_parts("report", {})) == []

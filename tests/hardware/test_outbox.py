@@ -3,7 +3,7 @@
 import time
 
 from madns_runtime.hardware import messages, outbox
-from madns_runtime.hardware.count_table import CELLS_MAX, TABLE_BYTES, CountTable, missed_name
+from madns_runtime.hardware.count_table import TABLE_BYTES, CountTable, missed_name
 from madns_runtime.hardware.outbox import UserOutbox
 from madns_runtime.reactor.reactor import Reactor
 
@@ -77,7 +77,9 @@ def test_who_never_takes_anything_loses_a_counted_number(monkeypatch):
 def test_very_many_agents_that_take_nothing_leave_room_for_a_devices_own_counts(monkeypatch):
     monkeypatch.setattr(outbox, "WAITING_MAX", 1)
     reactor = Reactor()
-    pairs = {f"agent-{number:02d}": messages.make_pair() for number in range(CELLS_MAX + 6)}
+    pairs = {
+        f"agent-{number:03d}": messages.make_pair() for number in range(outbox.USERS_NAMED_MAX + 6)
+    }
     counts = counts_in_memory()
     box = UserOutbox({agent: ends[1] for agent, ends in pairs.items()}, reactor, counts)
 

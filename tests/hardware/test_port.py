@@ -13,6 +13,7 @@ from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.count_table import missed_name
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort, Hardware
+from madns_runtime.hardware.profiles import POINTS_MAX, unpack_points
 from madns_runtime.hardware.status import StatusLimits
 from madns_runtime.protocol.codec import pack
 from madns_runtime.realtime.process_records import ProcessRecords
@@ -78,6 +79,23 @@ def test_what_a_device_has_no_room_for_is_counted(device):
     left = {"writes_left": 1, "points_left": 2 * port.PACKS_MAX}
     assert made.losses() == {"writes_lost": 1, "points_lost": 6, **left}
     assert Hardware({"line": made}).losses() == {"pi22/line": made.losses()}
+
+
+def test_as_many_points_as_may_wait_find_room_however_wide_their_output_is():
+    picture = Channel(name="picture", direction="out", shape=(64, 3))
+    ours, theirs = messages.make_pair()
+    shared, limits = (DevicePage([]), ours), StatusLimits.of(0.1, 1.0)
+    made = DevicePort("pi22/hat", (picture,), shared=shared, limits=limits)
+    times = []
+    with ours, theirs:
+        made.play("picture", ((float(k), (1.0,) * 192) for k in range(POINTS_MAX)))
+        while packs := list(messages.receive_all(theirs)):
+            for *_, data in packs:
+                times += [t_s for t_s, _ in unpack_points(picture, data)]
+            made.flush()
+
+    assert times == [float(k) for k in range(POINTS_MAX)]
+    assert made.losses() == {}
 
 
 def test_an_older_value_that_found_no_room_does_not_come_behind_a_newer_one(device, monkeypatch):

@@ -10,8 +10,11 @@ import pytest
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import profiles
 from madns_runtime.hardware.contract import NAME_CHARACTERS_MAX, Channel
-from madns_runtime.hardware.count_table import NAME_BYTES, NOT_FINITE
+from madns_runtime.hardware.count_table import NAME_BYTES, NOT_FINITE, REST, missed_name
 from madns_runtime.hardware.intake import FROZEN
+from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
+from madns_runtime.hardware.outbox import USERS_NAMED_MAX
+from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import (
     POINT_COUNTS,
     POINTS_MAX,
@@ -163,6 +166,21 @@ def test_what_is_counted_of_the_longest_name_has_room_for_all_of_it():
     counted = [count_name(word, name) for word in (*POINT_COUNTS, UNDERRUNS)]
 
     assert max(map(len, (*counted, f"{FROZEN}{name}", f"{name}{NOT_FINITE}"))) <= NAME_BYTES
+
+
+def test_a_device_of_as_many_outputs_as_there_may_be_has_each_count_of_each():
+    counts = DevicePage(()).counts
+    for number in range(USERS_NAMED_MAX):
+        counts.add(missed_name(f"agent-{number:03d}"))
+    for number in range(CHANNELS_MAX):
+        counts.add(f"coil_{number}_limited")
+        for word in (*POINT_COUNTS, UNDERRUNS):
+            counts.add(count_name(word, f"coil_{number}"))
+
+    told = counts.read()
+    assert REST not in told
+    assert set(counts_by_channel(told)) == {f"coil_{number}" for number in range(CHANNELS_MAX)}
+    assert all(set(each.values()) == {1} for each in counts_by_channel(told).values())
 
 
 def test_a_kind_that_makes_safe_needs_a_safe_value():

@@ -130,6 +130,46 @@ def test_an_end_on_purpose_takes_no_return_from_an_agent_that_is_lost_later(star
     assert (agent["state"], agent["incarnations"]) == ("stopped", 3)
 
 
+UNMADE = """
+from dataclasses import dataclass
+from madns_runtime.plugin.api import AgentSimulation, Simulation
+@dataclass(frozen=True)
+class Parameters:
+    fault: str = ""
+MADE = []
+class Agent(AgentSimulation):
+    def __init__(self):
+        MADE.append(self)
+        if len(MADE) == 7:
+            raise ValueError("its port is taken")
+    def setup(self, context, initial):
+        self.name = context.name
+    def step(self, tick):
+        if (self.name, tick.index) == ("agent-04", 2):
+            raise ValueError("told to")
+simulation = Simulation(name="unmade", parameters=Parameters, agent=":Agent")
+"""
+
+
+@pytest.mark.parametrize(("restarts_max", "state"), [(1, "lost"), (2, "stopped")])
+def test_an_agent_that_cannot_be_made_anew_is_lost_again_and_the_run_goes_on(
+    start_host, tmp_path, restarts_max, state
+):
+    (tmp_path / "unmade.py").write_text(UNMADE)
+    run = start_host(
+        simulation=f"{tmp_path}/unmade.py:simulation", restarts_max=restarts_max, per_process=6
+    )
+    result = run.result()
+
+    assert (result["status"], run.process.returncode) == ("complete", 0)
+    assert (result["lost"], result["not_stopped"]) == (["agent-04"], [])
+    agent = result["agents"]["agent-04"]
+    assert (agent["state"], agent["incarnations"]) == (state, restarts_max + 1)
+    assert agent["reason"].startswith("Agent.__init__ raised ValueError: its port is taken")
+    told = [event["event"] for event in run.events_of("agents/agent-04", ".2")]
+    assert told == ["start", "emergency", "end"]
+
+
 FORKING = """
 import os
 from dataclasses import dataclass

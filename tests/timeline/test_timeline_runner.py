@@ -1,7 +1,11 @@
 """A timeline while its run goes on, by simulated times alone."""
 
+import math
 from typing import Any
 
+import pytest
+
+from madns_runtime.timeline import runner as runner_module
 from madns_runtime.timeline.action import ActionKind, TimelineAction
 from madns_runtime.timeline.dispatcher import Dispatcher
 from madns_runtime.timeline.entries import ScheduledEntry
@@ -126,6 +130,32 @@ def test_a_condition_begins_what_waits_for_it_and_the_delay_is_recorded() -> Non
 
     assert handler.calls == [("begin", "kill", 7.0), ("end", "kill", 7.0)]
     assert [each["delay_s"] for each in events] == [0.5, 0.0]
+
+
+@pytest.mark.parametrize("met_s", [math.nan, math.inf, 50.0])
+def test_what_a_condition_begins_ends_whatever_time_the_record_bears(met_s) -> None:
+    runner, handler, events = a_runner(
+        ScheduledEntry(action="kill", condition=3, for_s=2.0, agents=("a",)),
+    )
+
+    runner.met(3, met_s=met_s, now_s=7.5)
+    assert runner.next_s == 9.5
+    runner.run_due(9.5)
+
+    assert handler.calls == [("begin", "kill", 7.5), ("end", "kill", 7.5)]
+    assert [(each["due_s"], each["delay_s"]) for each in events] == [(7.5, 0.0), (9.5, 0.0)]
+
+
+def test_live_orders_leave_what_waits_for_a_condition_its_room(monkeypatch) -> None:
+    monkeypatch.setattr(runner_module, "ORDERS_MAX", 2)
+    runner, handler, _ = a_runner(ScheduledEntry(action="kill", agents=("a",), condition=0))
+    live = OrderedAction(word="annotate", parameters={})
+
+    answers = [runner.order(live, t_s) for t_s in (1.0, 2.0, 3.0)]
+    runner.met(0, met_s=4.0, now_s=4.0)
+
+    assert answers == ["", "", "at most 2 actions may be ordered in one run"]
+    assert handler.calls[-1] == ("begin", "kill", 4.0)
 
 
 def test_orders_take_place_at_once() -> None:
