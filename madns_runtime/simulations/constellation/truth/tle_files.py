@@ -76,7 +76,7 @@ def _tle_set(
     return ElementSet(
         name=name or line1[2:7].strip(),
         epoch_utc=epoch,
-        lines=(line1[:69], line2[:69]),
+        lines=(_without_blanks(line1), line2[:69]),
         place=f"{where}:{first[0]}",
     )
 
@@ -89,6 +89,13 @@ def _tle_epoch(line1: str) -> datetime | None:
         return None
     epoch = start + timedelta(days=day - 1.0)
     return epoch if epoch.year == start.year else None
+
+
+def _without_blanks(line1: str) -> str:
+    """Return line 1 with zeros for blanks within a number: SGP4's reader would read on into the columns behind them."""
+    year = f"{int(line1[18:20]):02d}"
+    ddot, bstar = (line1[start:end].replace(" ", "0") for start, end in ((45, 50), (54, 59)))
+    return f"{line1[:18]}{year}{line1[20:45]}{ddot}{line1[50:54]}{bstar}{line1[59:69]}"
 
 
 def _tle_number_faults(where: str, first: tuple[int, str], second: tuple[int, str]) -> list[str]:
