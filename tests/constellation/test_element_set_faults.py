@@ -94,6 +94,8 @@ def test_sets_that_are_none_of_sgp4_are_refused_by_their_ephemeris_type(tmp_path
         (2, 33, " .0000Q181", "2: expected the columns of line 1 of a TLE"),
         (2, 18, "17366.00000000", "2: expected a day of its year, got 17366.00000000"),
         (2, 18, "17000.00000000", "2: expected a day of its year, got 17000.00000000"),
+        (2, 18, "  066.0", "2: expected a year and a day of it as 17066.0, got '  066.0"),
+        (2, 18, "17 6 .0", "2: expected a year and a day of it as 17066.0, got '17 6 .0"),
         (
             2,
             18,
