@@ -159,6 +159,20 @@ def test_nonsense_in_an_omm_is_found(tmp_path, suffix, key, value):
     assert "expected" in found[0] or "Expecting" in found[0], found[0]
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("CLASSIFICATION_TYPE", "unclassified"),
+        ("ELEMENT_SET_NO", "9" * 30),
+        ("REV_AT_EPOCH", "1.0"),
+    ],
+)
+def test_what_changes_no_orbit_may_be_anything(tmp_path, key, value):
+    (first, *rest) = json.loads(TEXTS["json"])
+
+    assert faults(tmp_path, "a.json", json.dumps([{**first, key: value}, *rest])) == []
+
+
 def test_a_value_that_is_given_twice_is_found(tmp_path):
     csv_text, json_text, xml_text = (TEXTS[suffix] for suffix in ("csv", "json", "xml"))
     head, *rows = csv_text.splitlines()

@@ -26,6 +26,8 @@ BOOKKEEPING = {
     "NORAD_CAT_ID": "0",
 }
 """OMM fields that change no orbit, and what stands for them where they are missing."""
+TAKEN = ("EPHEMERIS_TYPE", "NORAD_CAT_ID")
+"""Of these what a file says counts; whatever the others say, sgp4 is given what stands for them: it takes few forms."""
 FIXED_FIELDS = {
     "CENTER_NAME": "EARTH",
     "REF_FRAME": "TEME",
@@ -150,7 +152,8 @@ def _omm_set(fields: dict[str, str], at: str, faults: list[str]) -> Iterator[Ele
     if len(faults) > before or epoch is None:
         return
     kept = {key: fields[key].strip() for key in NUMBERS}
-    kept |= {key: fields.get(key, "").strip() or value for key, value in BOOKKEEPING.items()}
+    taken = {key: fields.get(key, "").strip() for key in TAKEN}
+    kept |= {key: taken.get(key) or value for key, value in BOOKKEEPING.items()}
     kept["EPOCH"] = epoch.strftime("%Y-%m-%dT%H:%M:%S.%f")
     yield ElementSet(name=name, epoch_utc=epoch, omm=tuple(sorted(kept.items())), place=at)
 
