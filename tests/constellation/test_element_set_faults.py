@@ -173,6 +173,17 @@ def test_what_changes_no_orbit_may_be_anything(tmp_path, key, value):
     assert faults(tmp_path, "a.json", json.dumps([{**first, key: value}, *rest])) == []
 
 
+@pytest.mark.parametrize("long", ["entry", "EPOCH", "REF_FRAME"])
+def test_a_fault_of_an_omm_shows_the_beginning_of_what_is_wrong(tmp_path, long):
+    sets = json.loads(TEXTS["json"])
+    wrong = sets if long == "entry" else {**sets[0], long: "x" * 10_000}
+
+    (fault,) = faults(tmp_path, "a.json", json.dumps([wrong]))
+
+    assert "expected" in fault
+    assert len(fault) < 250
+
+
 def test_a_value_that_is_given_twice_is_found(tmp_path):
     csv_text, json_text, xml_text = (TEXTS[suffix] for suffix in ("csv", "json", "xml"))
     head, *rows = csv_text.splitlines()
