@@ -173,6 +173,17 @@ def test_what_changes_no_orbit_may_be_anything(tmp_path, key, value):
     assert faults(tmp_path, "a.json", json.dumps([{**first, key: value}, *rest])) == []
 
 
+@pytest.mark.parametrize("name", ["A\nB", "A\u202eB", "A" * 201, ""])
+def test_a_name_that_no_table_can_hold_is_found_in_the_file(tmp_path, name):
+    first, second, *_ = json.loads(TEXTS["json"])
+    named = {**second, "OBJECT_NAME": name, "NORAD_CAT_ID": ""}
+
+    (fault,) = faults(tmp_path, "a.json", json.dumps([first, named], indent=0))
+
+    assert re.match(r"a\.json:[0-9]+: expected a name of at most 200 printable characters", fault)
+    assert faults(tmp_path, "a.json", json.dumps([first, named]), count=1) == []  # who flies not
+
+
 @pytest.mark.parametrize("long", ["entry", "EPOCH", "REF_FRAME"])
 def test_a_fault_of_an_omm_shows_the_beginning_of_what_is_wrong(tmp_path, long):
     sets = json.loads(TEXTS["json"])
