@@ -18,6 +18,7 @@ from madns_runtime.simulations.constellation.flight.interface import c_header, c
 from madns_runtime.simulations.constellation.flight.interface.answers import CommandRequest
 from madns_runtime.simulations.constellation.flight.interface.frames import Frames
 from madns_runtime.simulations.constellation.flight.interface.reports import SetupReport, TickReport
+from madns_runtime.simulations.constellation.flight.interface.space_packets import SpacePackets
 from madns_runtime.simulations.constellation.messages import (
     CommandResult,
     Delivery,
@@ -274,3 +275,14 @@ def test_first_hello_of_software_that_finds_the_setup_asks_for_nothing(is_kept, 
         again.append(kinds.count(1))
 
     assert again == setups
+
+
+@pytest.mark.parametrize("make", [Frames, SpacePackets])
+@pytest.mark.parametrize("count", range(10_905, 10_925))
+def test_a_message_too_long_as_json_is_counted_whatever_else_is_in_its_packet(make, count):
+    protocol = make()
+    message = Delivery(sender="a", sent_s=0.0, arrives_s=0.1, payload=[False] * count)
+
+    packets = protocol.tick(TickReport(t_s=0.1, messages=[message]))
+
+    assert len(packets) + protocol.faults["overflow"] == 2
