@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import orjson
 
 from madns_runtime.simulations.constellation.flight.api import Reading
@@ -320,4 +321,6 @@ def to_plain(value: Any) -> Any:
     """
     if isinstance(value, bytes):
         return {"base64": base64.b64encode(value).decode()}
+    if isinstance(value, np.ndarray) and not value.ndim:  # orjson knows those with axes alone
+        return value.item()
     raise TypeError(type(value).__name__)
