@@ -94,6 +94,8 @@ def test_sets_that_are_none_of_sgp4_are_refused_by_their_ephemeris_type(tmp_path
         (2, 33, " .0000Q181", "2: expected the columns of line 1 of a TLE"),
         (2, 18, "17366.00000000", "2: expected a day of its year, got 17366.00000000"),
         (2, 18, "17000.00000000", "2: expected a day of its year, got 17000.00000000"),
+        (2, 18, "  066.0", "2: expected a year and a day of it as 17066.0, got '  066.0"),
+        (2, 18, "17 6 .0", "2: expected a year and a day of it as 17066.0, got '17 6 .0"),
         (
             2,
             18,
@@ -155,6 +157,42 @@ def test_nonsense_in_an_omm_is_found(tmp_path, suffix, key, value):
     assert found, value
     assert all(re.match(rf"a\.{suffix}:[0-9]+:", fault) for fault in found), found
     assert "expected" in found[0] or "Expecting" in found[0], found[0]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("CLASSIFICATION_TYPE", "unclassified"),
+        ("ELEMENT_SET_NO", "9" * 30),
+        ("REV_AT_EPOCH", "1.0"),
+    ],
+)
+def test_what_changes_no_orbit_may_be_anything(tmp_path, key, value):
+    (first, *rest) = json.loads(TEXTS["json"])
+
+    assert faults(tmp_path, "a.json", json.dumps([{**first, key: value}, *rest])) == []
+
+
+@pytest.mark.parametrize("name", ["A\nB", "A\u202eB", "A" * 201, ""])
+def test_a_name_that_no_table_can_hold_is_found_in_the_file(tmp_path, name):
+    first, second, *_ = json.loads(TEXTS["json"])
+    named = {**second, "OBJECT_NAME": name, "NORAD_CAT_ID": ""}
+
+    (fault,) = faults(tmp_path, "a.json", json.dumps([first, named], indent=0))
+
+    assert re.match(r"a\.json:[0-9]+: expected a name of at most 200 printable characters", fault)
+    assert faults(tmp_path, "a.json", json.dumps([first, named]), count=1) == []  # who flies not
+
+
+@pytest.mark.parametrize("long", ["entry", "EPOCH", "REF_FRAME"])
+def test_a_fault_of_an_omm_shows_the_beginning_of_what_is_wrong(tmp_path, long):
+    sets = json.loads(TEXTS["json"])
+    wrong = sets if long == "entry" else {**sets[0], long: "x" * 10_000}
+
+    (fault,) = faults(tmp_path, "a.json", json.dumps([wrong]))
+
+    assert "expected" in fault
+    assert len(fault) < 250
 
 
 def test_a_value_that_is_given_twice_is_found(tmp_path):

@@ -70,6 +70,26 @@ def test_tle_works_without_names_with_comments_and_with_windows_line_ends(tmp_pa
     assert [s.name for s in read_element_sets(path)] == ["24792", "IRIDIUM 7"]
 
 
+@pytest.mark.parametrize(
+    ("written", "blank"),
+    [("1 24792U 97020A   05066.30", "1 24792U 97020A    5066.30"), (" 02330-4 ", "  233 -4 ")],
+    ids=["year", "bstar"],
+)
+def test_blanks_for_zeros_in_a_tle_are_those_zeros_to_sgp4_too(tmp_path, written, blank):
+    name, line1, line2 = TLE.splitlines()[:3]
+    line1 = line1.replace("1 24792U 97020A   17066.30", "1 24792U 97020A   05066.30")
+    line1 = f"{line1[:53]} 02330-4 {line1[62:68]}"
+    states = []
+    for place, text in enumerate((line1, line1.replace(written, blank))):
+        assert place == 0 or text != line1
+        path = tmp_path / f"{place}.tle"
+        path.write_text(f"{name}\n{text}{tle_checksum(text)}\n{line2}\n")
+        (element_set,) = read_element_sets(path)
+        states.append(sgp4_states((element_set,), element_set.epoch_utc, np.array([0.0, 6000.0])))
+
+    assert np.array_equal(*states)
+
+
 def test_a_wrong_checksum_is_named_with_its_line(tmp_path):
     lines = TLE.splitlines()
     lines[4] = lines[4].replace("17066", "17067")

@@ -9,6 +9,7 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from madns_runtime.hardware.framing import cobs_decode, cobs_encode
@@ -17,7 +18,9 @@ from madns_runtime.simulations.constellation.flight.api import Reading
 from madns_runtime.simulations.constellation.flight.interface import c_header, content, frames
 from madns_runtime.simulations.constellation.flight.interface.answers import CommandRequest
 from madns_runtime.simulations.constellation.flight.interface.frames import Frames
+from madns_runtime.simulations.constellation.flight.interface.json_lines import JsonLines
 from madns_runtime.simulations.constellation.flight.interface.reports import SetupReport, TickReport
+from madns_runtime.simulations.constellation.flight.interface.space_packets import SpacePackets
 from madns_runtime.simulations.constellation.messages import (
     CommandResult,
     Delivery,
@@ -274,3 +277,24 @@ def test_first_hello_of_software_that_finds_the_setup_asks_for_nothing(is_kept, 
         again.append(kinds.count(1))
 
     assert again == setups
+
+
+@pytest.mark.parametrize("make", [Frames, SpacePackets])
+@pytest.mark.parametrize("count", range(10_905, 10_925))
+def test_a_message_too_long_as_json_is_counted_whatever_else_is_in_its_packet(make, count):
+    protocol = make()
+    message = Delivery(sender="a", sent_s=0.0, arrives_s=0.1, payload=[False] * count)
+
+    packets = protocol.tick(TickReport(t_s=0.1, messages=[message]))
+
+    assert len(packets) + protocol.faults["overflow"] == 2
+
+
+@pytest.mark.parametrize("make", [JsonLines, Frames, SpacePackets])
+def test_an_array_without_axes_in_a_message_is_its_number(make):
+    payload = {"x": np.array(1.5), "y": np.array([2.5])}
+    message = Delivery(sender="a", sent_s=0.0, arrives_s=0.1, payload=payload)
+
+    packets = make().tick(TickReport(t_s=0.1, messages=[message]))
+
+    assert b'{"x":1.5,"y":[2.5]}' in b"".join(packets)

@@ -181,3 +181,17 @@ def test_what_the_code_refuses_the_schema_refuses(answer):
         carry_out(read_answer(json.dumps(answer).encode()), Deaf(), "x", t_s=1.0)
 
     assert not validator("from_program").is_valid(answer)
+
+
+@pytest.mark.parametrize(
+    "answer", [{"{}": 1}, {"log": [{"{}": ""}]}, {"commands": [{"delta_v_m_s": 0, "{}": 1}]}]
+)
+@pytest.mark.parametrize("key", ["A\nPASSED: 9 checks hold", "A\x1b[2J", "A" * 10_000])
+def test_a_key_that_a_program_made_up_is_told_in_one_line(answer, key):
+    line = json.dumps(answer).replace("{}", json.dumps(key)[1:-1]).encode()
+
+    fault = read_answer(line).fault
+
+    assert "got" in fault and "A" in fault
+    assert fault.isprintable()
+    assert len(fault) < 400

@@ -93,6 +93,7 @@ def test_a_rate_divides_the_ticks_or_is_a_multiple_of_theirs(rate_hz, expected):
         (25.0, "a whole multiple of it, got 25"),
         (1000.0, "at most 50 times agents.tick_hz, 10 Hz, got 1000"),
         (1e-5, "one step in at most 100000 ticks, 10 Hz"),
+        (1e-309, "one step in at most 100000 ticks, 10 Hz, got 1e-309"),
     ],
 )
 def test_a_rate_without_a_whole_ratio_is_refused(tmp_path, fly, rate_hz, words):

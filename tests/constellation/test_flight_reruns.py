@@ -10,9 +10,13 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.simulations.constellation import simulation
 from madns_runtime.simulations.constellation.check import find_faults
 from madns_runtime.simulations.constellation.check_flight import flight_faults
-from madns_runtime.simulations.constellation.flight.recorded_commands import RecordedCommands
+from madns_runtime.simulations.constellation.flight.recorded_commands import (
+    COMMANDS_MAX,
+    RecordedCommands,
+)
 from madns_runtime.simulations.constellation.flight_settings import FlightAttached, FlightClass
 from madns_runtime.simulations.constellation.rerun import for_rerun
+from madns_runtime.simulations.constellation.vehicle.commands import COMMANDS_PER_TICK_MAX
 
 ATTACHED = {"interface": {"transport": {"kind": "tcp", "address": "127.0.0.1:4000"}}}
 BEHIND = {
@@ -69,10 +73,13 @@ def test_recorded_results_are_of_lockstep_alone(tmp_path):
     ("rule", "why"), [(ATTACHED, "only attached to"), (FREE, "a clock of its")]
 )
 def test_software_that_cannot_be_stepped_is_named_and_its_commands_are_played(rule, why, tmp_path):
-    found = for_rerun(parameters(flight=[rule]), ("agent-01",), tmp_path)
+    given = parameters(flight=[{**rule, "rate_hz": 20.0}])
+
+    found = for_rerun(given, ("agent-01",), tmp_path)
 
     [played] = found.parameters.flight
     assert isinstance(played, FlightClass)
+    assert played.rate_hz == 20.0
     assert played.settings == {"agents": str(tmp_path / "agents")}
     assert "flight[0] (agents *)" in found.remarks[0] and why in found.remarks[0]
     assert not flight_faults(found.parameters, NAMES, tmp_path, is_lockstep=True)
@@ -126,6 +133,15 @@ def test_recorded_commands_are_given_in_their_ticks_and_those_of_devices_are_not
     software.step(0.2, {})
 
     assert desk.given == [((0.0, 0.1, 0.0), 1.5, "rtn"), ((1.0, 0.0, 0.0), 1.5, 0.5)]
+    assert COMMANDS_MAX == COMMANDS_PER_TICK_MAX
+    again = RecordedCommands()
+    again.setup(context)
+    desk.given.clear()
+    again.step(0.1, {})
+    again.step(0.12, {})  # of software that is faster than the ticks, in the first step of the tick
+    assert len(desk.given) == 2
+    again.step(0.2, {})
+    assert len(desk.given) == 2
     context.name = "agent-02"
     with pytest.raises(BlamedError, match="expected the commands of the recorded run, found none"):
         RecordedCommands().setup(context)

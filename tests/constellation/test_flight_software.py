@@ -24,6 +24,7 @@ from madns_runtime.simulations.constellation.messages import (
     Segment,
     TransmissionRefusal,
 )
+from madns_runtime.simulations.constellation.vehicle import flight_tick
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 
 HZ = 10.0
@@ -126,6 +127,18 @@ class G:
     assert measured.flight == {"names": ["clock"]}
     assert told.flight == {"names": ["truth"]}
     assert len(told.context.records["clock_sensor"]) == 1
+
+
+def test_measurements_that_it_is_not_given_are_not_counted_as_dropped(tmp_path, monkeypatch):
+    monkeypatch.setattr(flight_tick, "READINGS_MAX", 3)
+    sensors = {"gnss": {"rate_hz": HZ}}
+    ship = Ship(tmp_path, flight={"input": "truth"}, vehicles=[{"sensors": sensors}])
+
+    ship.run(0.8)
+
+    summary = ship.agent.finish()
+    assert summary["sensors"]["gnss"]["samples"] == 8
+    assert "readings_dropped" not in summary
 
 
 def test_it_is_given_no_truth_otherwise(tmp_path):

@@ -44,19 +44,19 @@ def flight_rate(rate_hz: float | None, tick_hz: float) -> FlightRate:
         return FlightRate(hz=tick_hz)
     is_faster = rate_hz >= tick_hz
     ratio = rate_hz / tick_hz if is_faster else tick_hz / rate_hz
-    whole = round(ratio)
-    if abs(ratio - whole) > RATIO_TOLERANCE * ratio:
-        raise ValueError(
-            f"expected a rate that divides agents.tick_hz, {tick_hz:g} Hz, or is a whole multiple of it, got {rate_hz:g}"
-        )
     most = STEPS_PER_TICK_MAX if is_faster else TICKS_PER_STEP_MAX
-    if whole > most:
+    if ratio > most + 0.5:  # of a rate that is next to nothing it may be infinite
         few = (
             f"at most {most} times agents.tick_hz"
             if is_faster
             else f"one step in at most {most} ticks"
         )
         raise ValueError(f"expected {few}, {tick_hz:g} Hz, got {rate_hz:g}")
+    whole = round(ratio)
+    if abs(ratio - whole) > RATIO_TOLERANCE * ratio:
+        raise ValueError(
+            f"expected a rate that divides agents.tick_hz, {tick_hz:g} Hz, or is a whole multiple of it, got {rate_hz:g}"
+        )
     if is_faster:
         return FlightRate(hz=rate_hz, steps_per_tick=whole)
     return FlightRate(hz=rate_hz, ticks_per_step=whole)

@@ -96,4 +96,4 @@ def _played(rule: FlightRule, number: int, run: Path, remarks: list[str]) -> Fli
     settings: dict[str, bool | int | float | str | list[float] | list[str]] = {
         "agents": str(run / "agents")
     }
-    return FlightClass(software=PLAYER, agents=rule.agents, settings=settings)
+    return FlightClass(software=PLAYER, agents=rule.agents, rate_hz=rule.rate_hz, settings=settings)

@@ -64,7 +64,17 @@ def state(tick, along_m=0.0):
 class Flown(SyntheticRun):
     """A run of satellites whose truth, measurements, estimates and commands are made up."""
 
-    def fly(self, *, along_m, noise_m, slot_error_deg, delta_v_m_s, turned_deg=None, rate_rad_s=0):
+    def fly(
+        self,
+        *,
+        along_m,
+        noise_m,
+        slot_error_deg,
+        delta_v_m_s,
+        turned_deg=None,
+        rate_rad_s=0,
+        apart_m=None,
+    ):
         host = self.recorder("host", "host", MANEUVERS)
         for number, name in enumerate(self.names):
             recorder = self.recorder(f"agents/{name}", name, STATE, GNSS, ESTIMATES, COMMANDS)
@@ -75,11 +85,12 @@ class Flown(SyntheticRun):
                 for tick in range(self.ticks):
                     bodies.record("attitude", (tick, *body))
                 bodies.close()
+            ahead_m = along_m * (number + 1) if apart_m is None else apart_m[number]
             for tick in range(self.ticks):
-                truth = state(tick, along_m * (number + 1))
+                truth = state(tick, ahead_m)
                 recorder.record("state", (tick, *truth))
                 if tick >= 2:  # measured two ticks ago
-                    x, *rest = state(tick - 2, along_m * (number + 1))
+                    x, *rest = state(tick - 2, ahead_m)
                     recorder.record("gnss", (tick, (tick - 2) / TICK_HZ, x + noise_m, *rest))
                 recorder.record("estimates", (tick, slot_error_deg))
             command = {"tick": 10, "number": 0, "kind": "delta_v", "x": 0.0, "y": delta_v_m_s}
@@ -127,6 +138,17 @@ def test_difference_in_position_is_told_by_agent_over_all_and_over_time(fly, cap
     assert truth["all"]["count"] == 2 * TICKS
     assert truth["over_time"][-1]["t_s"] == TICKS / TICK_HZ
     assert truth["over_time"][-1]["max_m"] == pytest.approx(60.0, rel=1e-6)
+
+
+def test_a_satellite_in_the_same_place_counts_over_time_as_over_all(fly, capsys):
+    fly(), fly(apart_m=(0.0, 30.0))
+
+    truth = compared(capsys)["truth"]
+
+    assert truth["agents"]["agent-01"]["max_m"] == 0.0
+    assert truth["all"]["rms_m"] == pytest.approx(30.0 / np.sqrt(2), rel=1e-6)
+    over_time = [row["rms_m"] for row in truth["over_time"]]
+    assert over_time == pytest.approx([30.0 / np.sqrt(2)] * len(over_time), rel=1e-6)
 
 
 def test_same_truth_is_no_distance_apart(fly, capsys):

@@ -50,13 +50,14 @@ def written(
     slots="even",
     sma_m=(),
     skipped=(),
+    lost=(),
     dead=(),
     raan_deg=(),
     crosslinks=None,
     rules=None,
     **more,
 ):
-    """A run at 1/600 Hz: satellite i at places_deg[i](tick); *skipped* record nothing, *dead* no beliefs."""
+    """A run at 1/600 Hz: satellite i at places_deg[i](tick); *skipped* record nothing, *lost* two ticks, *dead* no beliefs."""
     count = len(places_deg)
     settings = {"slots": slots, **more} if slots else {}
     flight = rules or {"settings": settings}
@@ -68,7 +69,7 @@ def written(
         if number in skipped:
             continue
         recorder = made.recorder(f"agents/{name}", name, STATE, ESTIMATES, RESULTS, MESSAGES)
-        for tick in range(TICKS):
+        for tick in range(2 if number in lost else TICKS):
             mean = CircularElements(
                 a_m=EGM_96.radius_m + 780e3 + (sma_m[number] if sma_m else 0.0),
                 ex=1e-4,
@@ -187,6 +188,15 @@ def test_agent_that_recorded_nothing_leaves_its_slot_empty_and_the_others_where_
     rows = rows_of(made)
 
     assert [row.slot_error_deg_rms for row in rows] == pytest.approx([0.0] * TICKS, abs=1e-3)
+
+
+def test_slots_are_judged_to_the_end_when_the_first_agent_is_lost(tmp_path):
+    made, _ = written(tmp_path, [lambda _t, n=n: 90.0 * n for n in range(4)], lost=(0,))
+
+    rows = rows_of(made)
+
+    assert [row.t_s for row in rows] == pytest.approx([600.0 * tick for tick in range(TICKS)])
+    assert [row.satellites for row in rows] == [4, 4, 3, 3, 3]
 
 
 def test_slots_of_a_chain_are_as_far_apart_as_the_scenario_says(tmp_path):

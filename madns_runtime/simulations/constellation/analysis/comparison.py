@@ -168,6 +168,7 @@ def _compare_positions(
     a: ComparedRun, b: ComparedRun, spread: BinnedRms
 ) -> tuple[dict[str, PositionDifference], list[Stretch]]:
     found: dict[str, PositionDifference] = {}
+    same: list[ComparedStream] = []
     for key, recorded in a.streams.items():
         other, names = b.streams.get(key), state_fields(recorded.names(), POSITION, VELOCITY)
         if key[0] != STATE or names is None or other is None:
@@ -175,6 +176,7 @@ def _compare_positions(
         agent = recorded.source
         if key in a.identical:
             found[agent] = PositionDifference(agent=agent, count=a.identical[key])
+            same.append(recorded)
             continue
         columns = [*names[0], *names[1]]
         keys = [_time_key(one, hz) for one, hz in ((recorded, _tick_hz(a)), (other, _tick_hz(b)))]
@@ -189,6 +191,12 @@ def _compare_positions(
             _add_positions(difference, piece, names, spread)
         if difference.count:
             found[agent] = difference
+    # Satellites that were in the same places count over time, too, where there are others.
+    for recorded in same if spread.rows() else ():
+        if (key := _time_key(recorded, _tick_hz(a))) is not None:
+            for columns in recorded.batches(key[:1]):
+                t_s = as_array(columns[key[0]]) * key[1]
+                spread.add(t_s, np.zeros(len(t_s)))
     return found, spread.rows()
 
 

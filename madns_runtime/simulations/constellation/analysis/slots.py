@@ -134,11 +134,16 @@ def _keeping_rule(parameters: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def recorded_times_s(tables: Tables) -> Floats:
-    """Return the times at which the first agent recorded its truth; none without truth on record."""
+    """Return the times at which any agent recorded its truth, ascending: one may be lost early; none without truth on record."""
     state = tables.get("state")
+    found = np.empty(0)
     if state is None or not state.has("t_s") or not state.rows:
-        return np.empty(0)
-    return as_array(state.read(state.sources[0], ("t_s",))["t_s"])
+        return found
+    for _, columns in state.each(("t_s",)):
+        t_s = as_array(columns["t_s"])
+        if not np.array_equal(t_s, found):  # most have the same
+            found = np.union1d(found, t_s)
+    return found
 
 
 def document(run: RecordedRun) -> dict[str, Any]:

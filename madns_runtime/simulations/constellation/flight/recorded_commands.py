@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from pathlib import Path
 from typing import Any, Final
@@ -16,6 +17,10 @@ from madns_runtime.simulations.constellation.flight.api import (
 
 DEVICES_FROM: Final = 2**30
 """Numbers from here on are commands of devices, which a rerun takes from the devices' records."""
+COMMANDS_MAX: Final = 16
+"""Of one step, as a vehicle takes them: of software that is faster than the ticks, the next steps of the tick give the others."""
+TICK_TOLERANCE: Final = 1e-6
+"""Rounding of times, in ticks."""
 
 
 class RecordedCommands(FlightSoftware):
@@ -41,9 +46,11 @@ class RecordedCommands(FlightSoftware):
                 self._rows[row["tick"]].append(row)
 
     def step(self, t_s: float, readings: Readings) -> None:
-        """Give the commands of this tick."""
+        """Give the commands of this tick, in the first of its steps: in real time that took all that had come."""
         context = self._context
-        for row in self._rows.pop(round(t_s * context.tick_hz), ()):
+        rows = self._rows.get(math.ceil(t_s * context.tick_hz - TICK_TOLERANCE), [])
+        given, rows[:] = rows[:COMMANDS_MAX], rows[COMMANDS_MAX:]
+        for row in given:
             vector, at_s = (row["x"], row["y"], row["z"]), row["at_s"]
             if row["kind"] == "delta_v":
                 context.delta_v(vector, at_s=at_s, frame=row["frame"])

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import MAXYEAR, UTC, datetime
 
+from madns_runtime.plain_values import shown
 from madns_runtime.simulations.constellation.truth.element_set import (
     FIRST_YEAR,
     NUMBERS,
@@ -26,6 +27,8 @@ BOOKKEEPING = {
     "NORAD_CAT_ID": "0",
 }
 """OMM fields that change no orbit, and what stands for them where they are missing."""
+TAKEN = ("EPHEMERIS_TYPE", "NORAD_CAT_ID")
+"""Of these what a file says counts; whatever the others say, sgp4 is given what stands for them: it takes few forms."""
 FIXED_FIELDS = {
     "CENTER_NAME": "EARTH",
     "REF_FRAME": "TEME",
@@ -83,7 +86,9 @@ def read_json(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]:
         line = lines[index] if len(lines) == len(entries) else 1
         at = f"{where}:{line}"
         if not isinstance(entry, dict):
-            faults.append(f"{at}: set {index + 1}: expected an object of OMM fields, got {entry!r}")
+            faults.append(
+                f"{at}: set {index + 1}: expected an object of OMM fields, got {shown(entry)}"
+            )
             continue
         fields = {key: str(value) for key, value in entry.items() if value is not None}
         yield from _omm_set(fields, at, faults)
@@ -136,7 +141,7 @@ def _omm_set(fields: dict[str, str], at: str, faults: list[str]) -> Iterator[Ele
     for key, expected in FIXED_FIELDS.items():
         given = fields.get(key, expected).strip().upper()
         if OTHER_WORDS.get((key, given), given) != expected:
-            faults.append(f"{at}: {key}: expected {expected}, got {fields[key]!r}")
+            faults.append(f"{at}: {key}: expected {expected}, got {shown(fields[key])}")
     if fault := theory_fault(fields.get("EPHEMERIS_TYPE", "")):
         faults.append(f"{at}: {fault}")
     for key in NUMBERS:
@@ -145,12 +150,13 @@ def _omm_set(fields: dict[str, str], at: str, faults: list[str]) -> Iterator[Ele
     epoch = _omm_epoch(fields.get("EPOCH", ""))
     if epoch is None:
         faults.append(
-            f"{at}: EPOCH: expected such as 2017-03-07T07:18:55.000000, got {fields.get('EPOCH')!r}"
+            f"{at}: EPOCH: expected such as 2017-03-07T07:18:55.000000, got {shown(fields.get('EPOCH'))}"
         )
     if len(faults) > before or epoch is None:
         return
     kept = {key: fields[key].strip() for key in NUMBERS}
-    kept |= {key: fields.get(key, "").strip() or value for key, value in BOOKKEEPING.items()}
+    taken = {key: fields.get(key, "").strip() for key in TAKEN}
+    kept |= {key: taken.get(key) or value for key, value in BOOKKEEPING.items()}
     kept["EPOCH"] = epoch.strftime("%Y-%m-%dT%H:%M:%S.%f")
     yield ElementSet(name=name, epoch_utc=epoch, omm=tuple(sorted(kept.items())), place=at)
 

@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.plain_values import LINE_CHARACTERS_MAX, is_line, shown
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
 from madns_runtime.simulations.constellation.orbit.elements import Elements
 from madns_runtime.simulations.constellation.parameters import (
@@ -25,7 +26,10 @@ from madns_runtime.simulations.constellation.parameters import (
     WalkerSatellites,
 )
 from madns_runtime.simulations.constellation.truth.element_set import FIRST_YEAR, ElementSet
-from madns_runtime.simulations.constellation.truth.element_sets import read_element_sets
+from madns_runtime.simulations.constellation.truth.element_sets import (
+    FAULTS_MAX,
+    read_element_sets,
+)
 
 EPOCH_WITHOUT_SETS = datetime(2000, 1, 1, 12, tzinfo=UTC)
 """Simulated time zero of patterns and elements for which the scenario names none: J2000, read as UTC."""
@@ -138,10 +142,28 @@ def _choose_sets(
     if len(sets) < count:
         raise _too_few("names" if satellites.names else "elements", len(sets), count)
     chosen = sets[:count]
+    faults = [
+        f"parameters.satellites.elements: {one.place}: {fault}"
+        for one in chosen
+        if (fault := _name_fault(one.name))
+    ]
+    if faults:
+        more = len(faults) - FAULTS_MAX
+        rest = [f"parameters.satellites.elements: and {more} more"] if more > 0 else []
+        raise ConfigurationError("\n".join(faults[:FAULTS_MAX] + rest))
     return SatelliteSelection(
         names=tuple(s.name for s in chosen),
         epoch_utc=_whole_second(max(s.epoch_utc for s in chosen)),
         element_sets=chosen,
+    )
+
+
+def _name_fault(name: str) -> str | None:
+    """Return what is wrong with a satellite's name, which stands in records, tables and messages."""
+    if name and is_line(name):
+        return None
+    return (
+        f"expected a name of at most {LINE_CHARACTERS_MAX} printable characters, got {shown(name)}"
     )
 
 
@@ -198,6 +220,8 @@ def _keplerian_orbits(
         if (orbit.a_km is None) == (orbit.altitude_km is None):
             faults.append(f"{where}: expected either a_km or altitude_km")
             continue
+        if fault := _name_fault(orbit.name):
+            faults.append(f"{where}.name: {fault}")
         elements = _elements(orbit, radius_m)
         if elements.a_m * (1.0 - elements.e) < radius_m:
             perigee_km = (elements.a_m * (1.0 - elements.e) - radius_m) / 1000.0

@@ -65,9 +65,15 @@ def _tle_set(
         )
     if len(faults) > before:
         return None
-    epoch = _tle_epoch(line1)
-    if epoch is None:
-        faults.append(f"{where}:{first[0]}: expected a day of its year, got {line1[18:32]}")
+    epoch: datetime | None = None
+    try:
+        epoch = _tle_epoch(line1)
+    except ValueError:  # blanks instead of a year's digits, or between those of the day
+        got = repr(line1[18:32])
+        faults.append(f"{where}:{first[0]}: expected a year and a day of it as 17066.0, got {got}")
+    else:
+        if epoch is None:
+            faults.append(f"{where}:{first[0]}: expected a day of its year, got {line1[18:32]}")
     if fault := theory_fault(line1[62]):
         faults.append(f"{where}:{first[0]}: {fault}")
     faults += _tle_number_faults(where, first, second)
@@ -76,19 +82,31 @@ def _tle_set(
     return ElementSet(
         name=name or line1[2:7].strip(),
         epoch_utc=epoch,
-        lines=(line1[:69], line2[:69]),
+        lines=(_without_blanks(line1), line2[:69]),
         place=f"{where}:{first[0]}",
     )
 
 
 def _tle_epoch(line1: str) -> datetime | None:
-    """Return the epoch in the columns of line 1; None if its year has no such day."""
+    """
+    Return the epoch in the columns of line 1; None if its year has no such day.
+
+    Raises:
+        ValueError: There are blanks where digits belong.
+    """
     year, day = int(line1[18:20]), float(line1[20:32])
     start = datetime(year + (2000 if year < FIRST_YEAR - 1900 else 1900), 1, 1, tzinfo=UTC)
     if not day >= 1.0:
         return None
     epoch = start + timedelta(days=day - 1.0)
     return epoch if epoch.year == start.year else None
+
+
+def _without_blanks(line1: str) -> str:
+    """Return line 1 with zeros for blanks within a number: SGP4's reader would read on into the columns behind them."""
+    year = f"{int(line1[18:20]):02d}"
+    ddot, bstar = (line1[start:end].replace(" ", "0") for start, end in ((45, 50), (54, 59)))
+    return f"{line1[:18]}{year}{line1[20:45]}{ddot}{line1[50:54]}{bstar}{line1[59:69]}"
 
 
 def _tle_number_faults(where: str, first: tuple[int, str], second: tuple[int, str]) -> list[str]:

@@ -169,7 +169,9 @@ class Cockpit:
         return self._board.desk.count
 
     def take(self, measured: Mapping[str, Sequence[Reading]]) -> None:
-        """Keep what became known of sensors for the next step; of very many readings the oldest are given up."""
+        """Keep what became known of sensors for the next step, if it is given that; of very many readings the oldest are given up."""
+        if self._is_truth_fed:
+            return
         for name, readings in measured.items():
             kept = self._news.get(name)
             if kept is None:

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import orjson
 
 from madns_runtime.simulations.constellation.flight.api import Reading
@@ -29,6 +30,8 @@ PENDING_MAX: Final = 1024
 """Requests that may come before a done; further ones are dropped and counted."""
 U32: Final = 2**32 - 1
 U16: Final = 2**16 - 1
+PAYLOAD_BYTES_MAX: Final = U16 - content.MESSAGE.size - 9
+"""Of a message to the program, whose struct, and in a Space Packet time and checksum less one, count in the same 16 bits."""
 FAULTS: Final = (
     "cut",
     "corrupt",
@@ -152,7 +155,7 @@ class Dialogue:
             }
             yield Said(content.READING, values, reading.values)
         encoded = [(one, *_payload(one.payload)) for one in tick.messages]
-        messages = [one for one in encoded if len(one[2]) <= U16]
+        messages = [one for one in encoded if len(one[2]) <= PAYLOAD_BYTES_MAX]
         self.faults["overflow"] += len(encoded) - len(messages)
         for message, encoding, payload in messages:
             yield Said(
@@ -318,4 +321,6 @@ def to_plain(value: Any) -> Any:
     """
     if isinstance(value, bytes):
         return {"base64": base64.b64encode(value).decode()}
+    if isinstance(value, np.ndarray) and not value.ndim:  # orjson knows those with axes alone
+        return value.item()
     raise TypeError(type(value).__name__)

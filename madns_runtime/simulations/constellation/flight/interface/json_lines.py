@@ -20,6 +20,7 @@ from typing import Any, Final, Literal
 import orjson
 
 from madns_runtime.errors import PluginError
+from madns_runtime.plain_values import is_line
 from madns_runtime.simulations.constellation.flight.interface.answers import (
     CommandRequest,
     FlightAnswer,
@@ -181,7 +182,7 @@ def _check(answer: Any) -> None:
     unknown = set(answer) - KEYS
     if unknown:
         raise PluginError(
-            f"expected the keys {', '.join(sorted(KEYS))}, got {', '.join(sorted(unknown))}"
+            f"expected the keys {', '.join(sorted(KEYS))}, got {_told(sorted(unknown))}"
         )
     t_s = answer.get("t_s")
     if t_s is not None and (isinstance(t_s, bool) or not isinstance(t_s, int | float)):
@@ -212,8 +213,14 @@ def _check_keys(
 ) -> None:
     if not must <= set(item) <= must | may:
         raise PluginError(
-            f"expected {what} with {', '.join(sorted(must))}, got {', '.join(item) or 'nothing'}"
+            f"expected {what} with {', '.join(sorted(must))}, got {_told(item) or 'nothing'}"
         )
+
+
+def _told(keys: Iterable[str]) -> str:
+    """Return keys of a program's as a message shows them, whatever is in them: in one line, and not without end."""
+    text = ", ".join(keys)
+    return text if is_line(text) else shown(text.encode())
 
 
 def message_schema() -> Schema:
