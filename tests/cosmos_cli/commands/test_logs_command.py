@@ -16,6 +16,7 @@ from harness.synthetic_run import MACHINE, SyntheticRun, make_config
 from harness.waiting import wait_until
 
 from cosmos_cli.app import run as cosmos
+from cosmos_cli.collect import log_follower
 from cosmos_cli.evidence import run_log
 from cosmos_cli.evidence.run_directory import begin_run
 from cosmos_cli.evidence.run_log import LogReading
@@ -377,3 +378,38 @@ def test_agent_that_the_run_has_not_is_bad_input(talking, capsys):
 
     assert cosmos(["logs", "last", "agent-3"]) == 2
     assert "no agent, host or machine named agent-3, did you mean" in capsys.readouterr().err
+
+
+@pytest.fixture
+def elsewhere(made):
+    """The same run, of which a machine holds a part that is not here yet."""
+    target = {"name": "pi01", "address": "192.0.2.1"}
+    machines = {"pi01": {"agents": ["a2"], "target": target}}
+    (made / "plan.json").write_text(json.dumps({"session": "00" * 16, "machines": machines}))
+    return made
+
+
+@pytest.mark.parametrize("arguments", [(), ("--follow",)])
+def test_fault_of_the_operators_own_ssh_configuration_is_told(
+    elsewhere, capsys, monkeypatch, arguments
+):
+    monkeypatch.setenv("COSMOS_SSH_CONFIG", "/nonexistent/config")
+
+    code = cosmos(["logs", *arguments])
+
+    assert code == 2
+    assert "COSMOS_SSH_CONFIG: /nonexistent/config: no such file" in capsys.readouterr().err
+
+
+def test_surprise_at_a_machine_is_its_failure_and_all_else_is_told(elsewhere, capsys, monkeypatch):
+    def connect(target, options):
+        raise ZeroDivisionError("nobody thought of it")
+
+    monkeypatch.setattr(log_follower, "connect", connect)
+
+    code = cosmos(["logs"])
+    told = capsys.readouterr()
+
+    assert code == 3
+    assert "pi01: its log cannot be read: unexpected ZeroDivisionError" in told.err
+    assert "host 5" in told.out
