@@ -87,25 +87,19 @@ class LogFollower:
                 is_alive = any(self._living.values()) or (is_following and is_living)
                 yield from self.reading.read_here(self.run.path, is_ended=not is_living)
                 yield from self._portions()
-                if is_alive:
-                    self._wait()
+                if is_alive:  # until a machine answers, or it is time to look here again
+                    yield from self._portions(LOOK_INTERVAL_S)
         finally:
             self._stop.set()
 
-    def _wait(self) -> None:
-        """Wait until a machine answers, or it is time to look here again."""
-        try:
-            answer = self._answers.get(timeout=LOOK_INTERVAL_S)
-        except Empty:
-            return
-        self._answers.put(answer)
-
-    def _portions(self) -> Iterator[list[LogLine]]:
+    def _portions(self, wait_s: float = 0.0) -> Iterator[list[LogLine]]:
+        """Yield what machines have answered, in its order; where that is nothing yet, what comes within *wait_s*."""
         while True:
             try:
-                answer = self._answers.get_nowait()
+                answer = self._answers.get(block=wait_s > 0.0, timeout=wait_s)
             except Empty:
                 return
+            wait_s = 0.0
             if answer.error is not None:
                 raise answer.error
             if answer.told is None:
