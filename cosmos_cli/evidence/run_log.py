@@ -87,7 +87,7 @@ class LogReading:
                 continue
             self.offsets[path] = int(told["end"])
             text = str(told["text"])
-            if (zero_s := _zero_in(text)) is not None:
+            if (zero_s := zero_in(text)) is not None:
                 self.zeros_s[path] = zero_s
             zero_s = self.zeros_s.get(path)
             lines += (replace(line, zero_s=zero_s) for line in self._wanted(path, text))
@@ -136,7 +136,7 @@ def posix_s(utc: object) -> float:
         return math.inf
 
 
-def _zero_in(text: str) -> float | None:
+def zero_in(text: str) -> float | None:
     """Return the simulated time zero that a stream's schema, or the line after it, tells; None where none does."""
     for found in _CONTROL_LINE.finditer(text):
         with contextlib.suppress(ValueError, RecursionError, AttributeError):

@@ -92,7 +92,7 @@ def build_sections(run: RunDirectory, document: Mapping[str, Any]) -> list[Secti
         *_gaps(run, recorded),
         *with_second_names(drawn_sections, run_labels(run)),
         *timeline_sections(actions),
-        *device_sections(document, recorded),
+        *device_sections(document, recorded, run.path),
         *_load_sections(document),
         *_words(recorded.tables),
     ]
