@@ -214,11 +214,7 @@ def _player(
         "directory": str(used.folder),
         "tick_hz": recorded.config.agents.tick_hz,
         "limits": {each.name: list(each.limits) for each in channels if each.limits is not None},
-        "queues": [
-            each.name
-            for each in channels
-            if each.passing == "queue" and each.direction == "in" and not each.is_frame
-        ],
+        "queues": [each.name for each in channels if each.passing == "queue" and not each.is_frame],
     }
     if agent.ticks is not None:
         parameters |= {"ticks": str(agent.ticks), "phase_s": agent.phase_s}
