@@ -200,7 +200,7 @@ def find_capacity(
         if trial.holds or failures >= trials.tries:
             search.tell(agents, holds=trial.holds)
             failures = 0
-    if not found.exit_code and not found.stopped_by and search.held == 0:
+    if not found.exit_code and search.held == 0:
         found.exit_code = ExitCode.BUDGET_BROKEN
     return found
 

@@ -16,10 +16,11 @@ from typing import Any
 
 from cosmos_cli.collect.machine_sources import RecordingMachine
 from cosmos_cli.collect.retrieval_state import asked_sources, read_note
+from cosmos_cli.errors import CosmosError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_log import LogLine, LogReading
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.failure import MachineFailure
+from cosmos_cli.fleet.failure import MachineFailure, unexpected
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.liveness import SilenceWatch
 from cosmos_cli.fleet.open_connection import connect
@@ -41,6 +42,8 @@ class _Answered:
     machine: str
     told: Told | None = None
     failure: MachineFailure | None = None
+    error: CosmosError | None = None
+    """Fault in the operator's own files, with which no machine can be asked."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -68,7 +71,12 @@ class LogFollower:
     _stop: threading.Event = field(default_factory=threading.Event)
 
     def lines(self, *, is_following: bool) -> Iterator[list[LogLine]]:
-        """Yield what was said, in portions: what is there now, and while *is_following* what comes until the run ends."""
+        """
+        Yield what was said, in portions: what is there now, and while *is_following* what comes until the run ends.
+
+        Raises:
+            CosmosError: A fault in the operator's own files, such as the ssh configuration.
+        """
         self._living = dict.fromkeys((source.machine for source in self.sources), True)
         for source in self.sources:
             threading.Thread(target=self._ask, args=(source, is_following), daemon=True).start()
@@ -79,25 +87,21 @@ class LogFollower:
                 is_alive = any(self._living.values()) or (is_following and is_living)
                 yield from self.reading.read_here(self.run.path, is_ended=not is_living)
                 yield from self._portions()
-                if is_alive:
-                    self._wait()
+                if is_alive:  # until a machine answers, or it is time to look here again
+                    yield from self._portions(LOOK_INTERVAL_S)
         finally:
             self._stop.set()
 
-    def _wait(self) -> None:
-        """Wait until a machine answers, or it is time to look here again."""
-        try:
-            answer = self._answers.get(timeout=LOOK_INTERVAL_S)
-        except Empty:
-            return
-        self._answers.put(answer)
-
-    def _portions(self) -> Iterator[list[LogLine]]:
+    def _portions(self, wait_s: float = 0.0) -> Iterator[list[LogLine]]:
+        """Yield what machines have answered, in its order; where that is nothing yet, what comes within *wait_s*."""
         while True:
             try:
-                answer = self._answers.get_nowait()
+                answer = self._answers.get(block=wait_s > 0.0, timeout=wait_s)
             except Empty:
                 return
+            wait_s = 0.0
+            if answer.error is not None:
+                raise answer.error
             if answer.told is None:
                 self._living[answer.machine] = False
                 if answer.machine not in self.failed and answer.failure is not None:
@@ -117,6 +121,11 @@ class LogFollower:
                 return
             except MachineFailure as failure:
                 self._answers.put(_Answered(source.machine, failure=failure))
+            except CosmosError as error:
+                self._answers.put(_Answered(source.machine, error=error))
+                return
+            except Exception as error:  # noqa: BLE001 - a thread that ends without a word is waited for for ever
+                self._answers.put(_Answered(source.machine, failure=unexpected(error)))
             if not is_following:
                 return
             self._stop.wait(AGAIN_S)

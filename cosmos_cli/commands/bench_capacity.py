@@ -112,7 +112,7 @@ def capacity(
     Find how many agents keep a budget of missed ticks, here or on an inventory, and what the plan predicts.
 
     Doubles their number until the budget breaks, then bisects; each trial is a run, and is kept. Ends with 4 when no
-    number keeps it, with 3 when machines failed.
+    number keeps it, or none was found in time, with 3 when machines failed.
     """
     console = Console(json=json, quiet=quiet, instead=f"the trials lie in {runs_root(runs)}")
     if first > largest:

@@ -19,7 +19,11 @@ from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.rerun.actions import action_remarks
 from cosmos_cli.rerun.device_comparison import compare_devices
-from cosmos_cli.rerun.early_ends import leave_out_after_ends, leave_out_after_simulated_time
+from cosmos_cli.rerun.early_ends import (
+    leave_out_after_ends,
+    leave_out_after_simulated_time,
+    leave_out_unwritten,
+)
 from cosmos_cli.rerun.expectations import compare_expectations
 from cosmos_cli.rerun.flown_software import (
     installed_remarks,
@@ -114,7 +118,10 @@ def _fly(
     with told_progress(console, "rerun") as progress:
         after = open_side(summary.run, summary.run.name)
         streams = compare(before, after, Selection(), progress)
-        remarks += leave_out_after_ends(streams.streams, flown.ends, before.tick_hz)
+        remarks += leave_out_after_ends(
+            streams.streams, flown.ends, before.tick_hz, recorded.killed
+        )
+        remarks += leave_out_unwritten(streams.only_b, flown.ends)
         if not recorded.config.time.is_lockstep:
             end_s = float(summary.document["duration_s"])
             remarks += leave_out_after_simulated_time(streams.streams, end_s)

@@ -127,16 +127,17 @@ def is_excused(scan: StreamScan, agents: Mapping[str, Any]) -> bool:
     """Tell whether what a file lacks was lost on purpose: its incarnation of an agent was ended by a fault."""
     if scan.file.role != "agent":
         return False
-    return scan.file.incarnation in _ended_on_purpose(mapping_at(agents, scan.file.source))
+    return scan.file.incarnation in ended_on_purpose(mapping_at(agents, scan.file.source))
 
 
 def _owes_records(agent: Mapping[str, Any]) -> bool:
     """Tell whether an agent was not ended on purpose, or has lived again after that."""
-    ended, incarnations = _ended_on_purpose(agent), agent.get("incarnations")
+    ended, incarnations = ended_on_purpose(agent), agent.get("incarnations")
     return not ended or (isinstance(incarnations, int) and incarnations > max(ended))
 
 
-def _ended_on_purpose(agent: Mapping[str, Any] | None) -> tuple[int, ...]:
+def ended_on_purpose(agent: Mapping[str, Any] | None) -> tuple[int, ...]:
+    """Return the incarnations of an agent that faults ended, by what the host's result tells of it."""
     ended = (agent or {}).get("ended_on_purpose")
     listed = ended if isinstance(ended, list | tuple) else ()
     return tuple(n for n in listed if type(n) is int and 0 < n <= INCARNATION_MAX)
@@ -158,7 +159,7 @@ def _check_source(
     if not scans:
         found.append("no records")
         return
-    lives = {scan.file.incarnation for scan in scans} | set(_ended_on_purpose(summary))
+    lives = {scan.file.incarnation for scan in scans} | set(ended_on_purpose(summary))
     found.extend(f"no records of incarnation {n}" for n in range(1, max(lives)) if n not in lives)
     have = {scan.file.stream for scan in scans}
     paths = {scan.file.path.name for scan in scans}

@@ -87,7 +87,7 @@ class LogReading:
                 continue
             self.offsets[path] = int(told["end"])
             text = str(told["text"])
-            if (zero_s := _zero_in(text)) is not None:
+            if (zero_s := zero_in(text)) is not None:
                 self.zeros_s[path] = zero_s
             zero_s = self.zeros_s.get(path)
             lines += (replace(line, zero_s=zero_s) for line in self._wanted(path, text))
@@ -123,12 +123,12 @@ def in_order(lines: Iterable[LogLine]) -> list[LogLine]:
     )
 
     def since_zero_s(line: LogLine) -> float:
-        return _posix_s(line.utc) - (common_s if line.zero_s is None else line.zero_s)
+        return posix_s(line.utc) - (common_s if line.zero_s is None else line.zero_s)
 
     return sorted(known, key=since_zero_s)
 
 
-def _posix_s(utc: object) -> float:
+def posix_s(utc: object) -> float:
     """Return an instant as a POSIX time, s; infinity for what is none."""
     try:
         return datetime.fromisoformat(utc).timestamp() if isinstance(utc, str) else math.inf
@@ -136,11 +136,11 @@ def _posix_s(utc: object) -> float:
         return math.inf
 
 
-def _zero_in(text: str) -> float | None:
+def zero_in(text: str) -> float | None:
     """Return the simulated time zero that a stream's schema, or the line after it, tells; None where none does."""
     for found in _CONTROL_LINE.finditer(text):
         with contextlib.suppress(ValueError, RecursionError, AttributeError):
-            zero_s = _posix_s(json.loads(found[0]).get("t0_utc"))
+            zero_s = posix_s(json.loads(found[0]).get("t0_utc"))
             if math.isfinite(zero_s):
                 return zero_s
     return None

@@ -93,3 +93,12 @@ def runs_no_commands(status: int, said: str) -> MachineFailure:
         "give the user a login shell there (`sudo chsh -s /bin/bash USER`) with start-up files that let commands"
         " run, or name another user in ansible_user",
     )
+
+
+def unexpected(error: Exception) -> MachineFailure:
+    """Return the failure of a machine at which something happened that nobody thought of."""
+    return MachineFailure(
+        FailureKind.DEFECT,
+        f"unexpected {type(error).__name__}: {error}",
+        "this is a defect of COSMoS, please report it",
+    )

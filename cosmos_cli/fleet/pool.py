@@ -10,7 +10,7 @@ from queue import Empty, SimpleQueue
 from typing import Generic, TypeVar
 
 from cosmos_cli.errors import CosmosError
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.failure import MachineFailure, unexpected
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.ui.step_times import WHOLE, timed
@@ -98,11 +98,7 @@ def _attempt(target: Target, task: Callable[[Target], T]) -> Outcome[T] | Cosmos
     except CosmosError as error:
         return error
     except Exception as error:  # noqa: BLE001 - one machine's surprise must not hide the others' results
-        failure = MachineFailure(
-            FailureKind.DEFECT,
-            f"unexpected {type(error).__name__}: {error}",
-            "this is a defect of COSMoS, please report it",
-        )
+        failure = unexpected(error)
     return Outcome(
         machine=target.name,
         value=value,

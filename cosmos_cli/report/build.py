@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
+from operator import itemgetter
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -10,11 +12,12 @@ from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.datagrams import WORDS
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import fault_of_plan
-from cosmos_cli.evidence.run_log import cut_text
+from cosmos_cli.evidence.run_log import cut_text, posix_s
 from cosmos_cli.evidence.simulation_calls import call_simulation, check_blocks, json_document
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.evidence.tables import no_tables, open_recorded_run
 from cosmos_cli.evidence.verdict import is_number
+from cosmos_cli.report.clock_zeros import zeros_s
 from cosmos_cli.report.devices import device_sections, is_told_in_words
 from cosmos_cli.report.expectations import expectation_sections
 from cosmos_cli.report.health import health_blocks, process_blocks
@@ -30,8 +33,10 @@ from cosmos_cli.report.timing import clock_blocks, reached_s, tick_blocks
 from madns_runtime.analysis import chapters
 from madns_runtime.analysis.chapters import Chapter
 from madns_runtime.analysis.lines import generic_blocks
-from madns_runtime.analysis.tables import RecordedRun, Tables
+from madns_runtime.analysis.sampling import as_array
+from madns_runtime.analysis.tables import RecordedRun, RecordedTable, Tables
 from madns_runtime.analysis.values import Heading, ReportRemark, Section, TableBlock, headings
+from madns_runtime.conditions.condition import HOST
 from madns_runtime.errors import PluginError
 from madns_runtime.recording.records import CLOCK, HEALTH, LATE_TICKS, PROCESS, TICKS
 
@@ -87,7 +92,7 @@ def build_sections(run: RunDirectory, document: Mapping[str, Any]) -> list[Secti
         *_gaps(run, recorded),
         *with_second_names(drawn_sections, run_labels(run)),
         *timeline_sections(actions),
-        *device_sections(document, recorded),
+        *device_sections(document, recorded, run.path),
         *_load_sections(document),
         *_words(recorded.tables),
     ]
@@ -210,29 +215,42 @@ def _call_tables(account: Mapping[str, Any]) -> Iterator[TableBlock]:
 
 
 def _words(tables: Tables) -> list[Section]:
-    rows = [row for name in ("host_log", "log") for row in _sentences(tables, name)]
-    rows.sort(key=lambda row: str(row[0]))
-    if not rows:
+    zeros = zeros_s(map(tables.get, TEXT_STREAMS))
+    common_s = zeros.get(HOST, min(zeros.values(), default=0.0))
+    found = [
+        sentence
+        for name in ("host_log", "log")
+        for sentence in _sentences(tables.get(name), zeros, common_s)
+    ]
+    if not found:
         return []
-    note = f"The first {SENTENCES_MAX} of {len(rows)}." if len(rows) > SENTENCES_MAX else ""
+    rows = [row for _, row in sorted(found, key=itemgetter(0))]
+    note = "In order of simulated time; UTC is by the clock of whoever said it."
+    cut = f"The first {SENTENCES_MAX} of {len(rows)}. " if len(rows) > SENTENCES_MAX else ""
     heads = ("UTC", "who", "level", "what was said")
     table = TableBlock(
         title="Warnings and errors",
         headings=[Heading(text=text, is_number=False) for text in heads],
         rows=rows[:SENTENCES_MAX],
-        note=note,
+        note=cut + note,
     )
     return [Section(title="What was said", blocks=[table])]
 
 
-def _sentences(tables: Tables, name: str) -> Iterator[list[object]]:
-    table = tables.get(name)
-    if table is None or not table.has("utc", "level", "text"):
+def _sentences(
+    table: RecordedTable | None, zeros: Mapping[str, float], common_s: float
+) -> Iterator[tuple[float, list[object]]]:
+    """Yield the rows of a log's warnings, each with the simulated time of it, s: by its clock where it tells none."""
+    if table is None or not table.has("t_s", "utc", "level", "text"):
         return
-    for who, columns in table.each(("utc", "level", "text")):
-        for utc, level, text in zip(*columns.values(), strict=True):
+    for who, columns in table.each(("t_s", "utc", "level", "text")):
+        zero_s = zeros.get(who, common_s)
+        times_s = as_array(columns["t_s"]).tolist()
+        texts = (columns[name] for name in ("utc", "level", "text"))
+        for t_s, utc, level, text in zip(times_s, *texts, strict=True):
             if level in LEVELS_TOLD:
-                yield [utc, who, level, cut_text(str(text))]
+                since_s = t_s if math.isfinite(t_s) else posix_s(utc) - zero_s
+                yield since_s, [utc, who, level, cut_text(str(text))]
 
 
 def figures_of(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:

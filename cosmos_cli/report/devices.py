@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from cosmos_cli.evidence.completeness import mapping_at
@@ -29,8 +30,8 @@ def is_told_in_words(table: str) -> bool:
     return table.startswith("device_") and table.endswith((".events", ".log"))
 
 
-def device_sections(document: Mapping[str, Any], run: RecordedRun) -> list[Section]:
-    """Return the chapter; none of a run without devices."""
+def device_sections(document: Mapping[str, Any], run: RecordedRun, folder: Path) -> list[Section]:
+    """Return the chapter; none of a run without devices. *folder* is the run's directory."""
     devices = mapping_at(document, "devices")
     if not devices:
         return []
@@ -48,7 +49,7 @@ def device_sections(document: Mapping[str, Any], run: RecordedRun) -> list[Secti
         rows=rows,
         note="What nobody has given account of was not measured, and breaks its check.",
     )
-    return [Section(title="Devices", blocks=[table, *temperature_blocks(run)])]
+    return [Section(title="Devices", blocks=[table, *temperature_blocks(run, folder)])]
 
 
 def _counts(devices: Mapping[str, Any], name: str) -> str:

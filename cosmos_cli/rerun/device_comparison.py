@@ -8,6 +8,7 @@ values of an output by the times at which they were due, or in their order where
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -164,16 +165,22 @@ def _in_order(a: Sequence[Row], b: Sequence[Row]) -> list[tuple[Row | None, Row 
 
 
 def _by_time(a: Sequence[Row], b: Sequence[Row]) -> list[tuple[Row | None, Row | None]]:
-    """Pair what was due at the same time; in their order what mostly was not: then each tick wrote in its own time."""
+    """
+    Pair what was due at the same time, several of one time in their order.
+
+    In their order all that mostly was not: then each tick wrote in its own time.
+    """
     pairs: list[tuple[Row | None, Row | None]] = []
-    of_b = {round(row[0] * 1e5): row for row in b}
+    of_b: dict[int, deque[Row]] = {}
+    for row in b:
+        of_b.setdefault(round(row[0] * 1e5), deque()).append(row)
     for row in a:
         key = round(row[0] * 1e5)
-        near = next((each for each in (key, key - 1, key + 1) if each in of_b), None)
-        pairs.append((row, None if near is None else of_b.pop(near)))
+        near = next((each for each in (key, key - 1, key + 1) if of_b.get(each)), None)
+        pairs.append((row, None if near is None else of_b[near].popleft()))
     if sum(other is not None for _, other in pairs) * 2 < min(len(a), len(b)):
         return _in_order(a, b)
-    pairs += [(None, row) for row in of_b.values()]
+    pairs += [(None, row) for rows in of_b.values() for row in rows]
     return sorted(pairs, key=lambda pair: (pair[0] or pair[1] or (0.0,))[0])
 
 

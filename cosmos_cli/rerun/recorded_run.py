@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from cosmos_cli.collect.finished_run import collected_document
 from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.completeness import ended_on_purpose
 from cosmos_cli.evidence.devices import expected_devices
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.table_labels import run_labels
@@ -48,10 +49,10 @@ class RecordedAgent:
     """The ticks of one agent."""
 
     ticks: Path | None
-    """Its stream of ticks; None in lockstep, which is always on time."""
+    """Its stream of ticks; None in lockstep, which is always on time, and of one that was killed before it wrote any."""
     phase_s: float = 0.0
     last_s: float = 0.0
-    """Nominal time of its last tick, s."""
+    """Nominal time of its last tick, s; negative of one that was killed before it wrote any."""
     last_wake_s: float = 0.0
     """When that woke up, simulated, s."""
     missed: int = 0
@@ -70,6 +71,8 @@ class FlownRun:
     devices: tuple[UsedDevice, ...]
     is_cut_off: bool = False
     """Whether it was in real time and did not complete: its agents need not have ended with the same tick."""
+    killed: frozenset[str] = frozenset()
+    """Agents of a run in real time that a fault ended for good: what they had not written yet is on no record."""
 
     @property
     def folder(self) -> Path:
@@ -107,11 +110,14 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None) -
     names = config.agents.resolved_names()
     faults: list[str] = []
     agents = {}
+    killed = _killed(run, config)
     for name in names:
         try:
-            agents[name] = _read_agent(run.path / "agents" / name, config)
+            agents[name] = _read_agent(run.path / "agents" / name, config, is_killed=name in killed)
         except InputError as error:
             faults.append(str(error))
+    if not faults and all(agent.last_s < 0.0 for agent in agents.values()):
+        faults.append("every agent was killed before any of its ticks was written")
     devices = tuple(_devices(run, config, plan, faults))
     if faults:
         more = len(faults) - FAULTS_SHOWN_MAX
@@ -119,7 +125,22 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None) -
         raise InputError(f"{run.name} cannot be flown again: {told}")
     status = (run.read_json(run.run_json) or {}).get("status")
     is_cut_off = not config.time.is_lockstep and status != "complete"
-    return FlownRun(run=run, config=config, agents=agents, devices=devices, is_cut_off=is_cut_off)
+    return FlownRun(
+        run=run,
+        config=config,
+        agents=agents,
+        devices=devices,
+        is_cut_off=is_cut_off,
+        killed=killed,
+    )
+
+
+def _killed(run: RunDirectory, config: RunConfig) -> frozenset[str]:
+    """Return the agents of a run in real time that a fault ended, by what its host told."""
+    if config.time.is_lockstep:
+        return frozenset()
+    told = mapping_at(run.read_json(run.result_json), "agents")
+    return frozenset(str(name) for name in told if ended_on_purpose(mapping_at(told, name)))
 
 
 def scenario_folder(run: RunDirectory) -> Path | None:
@@ -129,9 +150,9 @@ def scenario_folder(run: RunDirectory) -> Path | None:
     return folder if folder is not None and os.path.isdir(folder) else None
 
 
-def _read_agent(folder: Path, config: RunConfig) -> RecordedAgent:
+def _read_agent(folder: Path, config: RunConfig, *, is_killed: bool) -> RecordedAgent:
     """
-    Read an agent's ticks.
+    Read an agent's ticks; one that a fault killed may have written none.
 
     Raises:
         InputError: They are not there, or the agent was started anew.
@@ -144,12 +165,16 @@ def _read_agent(folder: Path, config: RunConfig) -> RecordedAgent:
         raise InputError(
             f"{name} was lost and started anew, which lockstep cannot repeat; rerun a run in which it lived"
         )
+    if is_killed and _size(ticks) == 0:
+        return _without_ticks(config)
     try:
         stream = read_stream(ticks)
         rows = [row for row in stream.records() if len(row) >= TICK_FIELDS]
         phase_s = _phase_of(folder)
     except (MadnsError, OSError, ValueError, TypeError) as error:
         raise InputError(f"{name}: its ticks cannot be read: {error}") from error
+    if not rows and is_killed:
+        return _without_ticks(config)
     if not rows:
         raise InputError(f"{name}: {ticks}: expected its ticks, found none")
     if not all(map(_is_tick, rows)):
@@ -163,6 +188,19 @@ def _read_agent(folder: Path, config: RunConfig) -> RecordedAgent:
         missed=sum(row[3] for row in rows),
         under_way=tuple(_under_way(rows, config.agents.tick_hz, phase_s)),
     )
+
+
+def _without_ticks(config: RunConfig) -> RecordedAgent:
+    """Return an agent that wrote no tick: its last one would have come before time zero."""
+    last_s = -1.0 / config.agents.tick_hz
+    return RecordedAgent(ticks=None, last_s=last_s, last_wake_s=last_s)
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
 
 
 def _is_tick(row: object) -> bool:

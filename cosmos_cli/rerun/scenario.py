@@ -46,7 +46,7 @@ class RerunScenario:
     left_out: tuple[str, ...] = ()
     """Words of actions that are not carried over."""
     ends: Mapping[str, float] = field(default_factory=dict)
-    """Of a run that was cut off: agents that ended before others, each with the time of its last tick, s."""
+    """Agents that ended before others, as the run was cut off or they were killed, each with the time of its last tick, s."""
 
 
 def make_rerun(recorded: FlownRun) -> RerunScenario:
@@ -74,7 +74,11 @@ def make_rerun(recorded: FlownRun) -> RerunScenario:
         scenario=scenario,
         remarks=tuple(dict.fromkeys([*remarks, *carried.remarks])),
         left_out=tuple(carried.left_out),
-        ends=early_ends(recorded.agents) if recorded.is_cut_off else {},
+        ends={
+            name: last_s
+            for name, last_s in early_ends(recorded.agents).items()
+            if recorded.is_cut_off or name in recorded.killed
+        },
         unlike=() if config.time.is_lockstep else tuple(told["unlike"]),
     )
 
@@ -214,11 +218,7 @@ def _player(
         "directory": str(used.folder),
         "tick_hz": recorded.config.agents.tick_hz,
         "limits": {each.name: list(each.limits) for each in channels if each.limits is not None},
-        "queues": [
-            each.name
-            for each in channels
-            if each.passing == "queue" and each.direction == "in" and not each.is_frame
-        ],
+        "queues": [each.name for each in channels if each.passing == "queue" and not each.is_frame],
     }
     if agent.ticks is not None:
         parameters |= {"ticks": str(agent.ticks), "phase_s": agent.phase_s}

@@ -159,7 +159,8 @@ def _statistic(
         for columns in table.batches(source, (figure.field,), ROWS_MAX):
             values = as_array(columns[figure.field])
             samples.add(Distribution.of(values))
-            last = float(values[-1]) if len(values) else last
+            there = values[~np.isnan(values)]
+            last = float(there[-1]) if len(there) else last
         newest.append(last)
     summary = samples.summary()
     if summary is None:

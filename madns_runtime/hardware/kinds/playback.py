@@ -49,7 +49,7 @@ class PlaybackParameters:
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """By channel, of one number or more: least and largest value, for these are not on record."""
     queues: tuple[str, ...] = ()
-    """Inputs of which each value arrives once, in order; frames do in any case."""
+    """Channels of which each value arrives once, in order; frames do in any case."""
 
 
 def channels_of(parameters: PlaybackParameters) -> tuple[Channel, ...]:

@@ -178,6 +178,25 @@ def test_no_trial_begins_when_the_time_is_over():
         "the time is over",
         "nothing is known yet",
     )
+    assert found.exit_code == ExitCode.BUDGET_BROKEN  # no number was found
+
+
+def test_search_whose_time_is_over_before_a_number_held_has_found_none(monkeypatch):
+    times_s = iter([0.0, 60.0])
+    monkeypatch.setattr("cosmos_cli.bench.capacity.time.monotonic", lambda: next(times_s))
+    found, _ = search(Runs(0), end_s=60.0)
+
+    assert (found.stopped_by, found.search.held) == ("the time is over", 0)
+    assert found.words == "8 agents break it, and no smaller number kept it"
+    assert found.exit_code == ExitCode.BUDGET_BROKEN
+
+
+def test_search_whose_time_is_over_has_found_what_held_until_then(monkeypatch):
+    times_s = iter([0.0, 60.0])
+    monkeypatch.setattr("cosmos_cli.bench.capacity.time.monotonic", lambda: next(times_s))
+    found, _ = search(Runs(99), end_s=60.0)
+
+    assert (found.stopped_by, found.words) == ("the time is over", "at least 8 agents keep it")
     assert found.exit_code == ExitCode.OK
 
 

@@ -9,16 +9,21 @@ import shutil
 import signal
 import subprocess
 import sys
+from itertools import islice, pairwise
 from pathlib import Path
+from queue import SimpleQueue
+from types import SimpleNamespace
 
 import pytest
 from harness.synthetic_run import MACHINE, SyntheticRun, make_config
 from harness.waiting import wait_until
 
 from cosmos_cli.app import run as cosmos
+from cosmos_cli.collect import log_follower
 from cosmos_cli.evidence import run_log
-from cosmos_cli.evidence.run_directory import begin_run
+from cosmos_cli.evidence.run_directory import RunDirectory, begin_run
 from cosmos_cli.evidence.run_log import LogReading
+from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.onboard import log_tail
 from cosmos_cli.onboard.request_loop import VerbRequest
 
@@ -377,3 +382,83 @@ def test_agent_that_the_run_has_not_is_bad_input(talking, capsys):
 
     assert cosmos(["logs", "last", "agent-3"]) == 2
     assert "no agent, host or machine named agent-3, did you mean" in capsys.readouterr().err
+
+
+@pytest.fixture
+def elsewhere(made):
+    """The same run, of which a machine holds a part that is not here yet."""
+    target = {"name": "pi01", "address": "192.0.2.1"}
+    machines = {"pi01": {"agents": ["a2"], "target": target}}
+    (made / "plan.json").write_text(json.dumps({"session": "00" * 16, "machines": machines}))
+    return made
+
+
+@pytest.mark.parametrize("arguments", [(), ("--follow",)])
+def test_fault_of_the_operators_own_ssh_configuration_is_told(
+    elsewhere, capsys, monkeypatch, arguments
+):
+    monkeypatch.setenv("COSMOS_SSH_CONFIG", "/nonexistent/config")
+
+    code = cosmos(["logs", *arguments])
+
+    assert code == 2
+    assert "COSMOS_SSH_CONFIG: /nonexistent/config: no such file" in capsys.readouterr().err
+
+
+def test_surprise_at_a_machine_is_its_failure_and_all_else_is_told(elsewhere, capsys, monkeypatch):
+    def connect(target, options):
+        raise ZeroDivisionError("nobody thought of it")
+
+    monkeypatch.setattr(log_follower, "connect", connect)
+
+    code = cosmos(["logs"])
+    told = capsys.readouterr()
+
+    assert code == 3
+    assert "pi01: its log cannot be read: unexpected ZeroDivisionError" in told.err
+    assert "host 5" in told.out
+
+
+class AnswersAtOnce(SimpleQueue):
+    """A queue into which all answers come in just the moment in which they are waited for."""
+
+    def __init__(self, answers):
+        super().__init__()
+        self.coming = list(answers)
+
+    def get(self, block=True, timeout=None):
+        for answer in self.coming if block else ():
+            self.put(answer)
+        self.coming = self.coming if not block else []
+        return super().get(block, timeout)
+
+
+def test_answers_of_a_machine_are_taken_in_their_order_whenever_they_come(made, monkeypatch):
+    first, second = (record(second, "info", f"a2 {second}") for second in (7, 8))
+    ends = (0, len(first), len(first + second))
+    answers = [
+        log_follower._Answered(
+            "pi01",
+            told={
+                "files": {"agents/a3/log.jsonl": {"start": start, "end": end, "text": text}},
+                "living": False,
+                "more": text is first,
+            },
+        )
+        for (start, end), text in zip(pairwise(ends), (first, second), strict=True)
+    ]
+    monkeypatch.setattr(log_follower.LogFollower, "_ask", lambda *_: None)
+    follower = log_follower.LogFollower(
+        run=RunDirectory(made),
+        sources=[SimpleNamespace(machine="pi01")],
+        reading=LogReading(source="a3"),
+        options=ConnectOptions(),
+        on_failure=lambda *_: None,
+        _answers=AnswersAtOnce(answers),
+    )
+
+    portions = follower.lines(is_following=False)
+    told = [line.text for portion in islice(portions, 20) for line in portion]
+
+    assert told == ["a2 7", "a2 8"]
+    assert next(portions, None) is None  # nobody is waited for any more

@@ -33,7 +33,7 @@ from madns_runtime.analysis.values import (
 )
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
-from madns_runtime.recording.records import LOG, Field, StreamSchema
+from madns_runtime.recording.records import EVENTS, LOG, Field, StreamSchema
 
 INVARIANTS = StreamSchema(
     "invariants",
@@ -276,6 +276,43 @@ def test_warnings_and_errors_are_told_in_words(tmp_path):
     assert [row[1:] for row in rows] == [["agent-01", "warning", "the <battery> is low"]]
     page = made.run.report_html.read_text()
     assert "the &lt;battery&gt; is low" in page
+
+
+def test_sentences_of_boards_whose_clocks_are_years_off_come_in_order_of_time(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr("cosmos_cli.report.build.SENTENCES_MAX", 3)
+    made = SyntheticRun(tmp_path)
+    made.write()
+
+    def say(folder, source, zero, *records):
+        recorder = made.recorder(folder, source, EVENTS, LOG)
+        recorder.record("events", {"t_s": 0.0, "utc": zero, "event": "start"})
+        for t_s, utc, text in records:
+            recorder.record("log", {"t_s": t_s, "utc": utc, "level": "warning", "text": text})
+        recorder.close()
+
+    say(
+        "agents/agent-01",
+        "agent-01",
+        "1999-01-01T00:00:10.000Z",
+        (None, "1999-01-01T00:00:08.000Z", "third, before time zero"),
+        (1.0, "1999-01-01T00:00:11.000Z", "fifth"),
+    )
+    say(
+        "agents/agent-02",
+        "agent-02",
+        "2055-01-01T00:00:10.000Z",
+        (None, "2055-01-01T00:00:05.000Z", "first, before time zero"),
+        (0.5, "2055-01-01T00:00:10.500Z", "fourth"),
+    )
+    say("host", "host", T0_UTC, (None, "2024-05-06T07:08:06.000Z", "second, before time zero"))
+
+    _, sections = build(made)
+
+    table = table_of(sections["What was said"], "Warnings")
+    assert [row[3].split(",")[0] for row in table.rows] == ["first", "second", "third"]
+    assert table.note.startswith("The first 3 of 5")
 
 
 def test_sentence_without_end_is_cut_and_says_so(tmp_path):

@@ -1,7 +1,7 @@
 """Figures of devices: their delay to the host's record, and their temperature beside the board's."""
 
 import numpy as np
-from harness.synthetic_run import MACHINE, SyntheticRun
+from harness.synthetic_run import MACHINE, T0_UTC, SyntheticRun
 
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.report.build import build_sections
@@ -20,8 +20,9 @@ def sections_of(made, **changes):
     return {section.title: section.blocks for section in build_sections(made.run, document)}
 
 
-def measured(made, degrees, source=f"{MACHINE}/hat"):
+def measured(made, degrees, source=f"{MACHINE}/hat", zero_utc=T0_UTC):
     recorder = made.recorder(f"devices/{source}", source, TEMPERATURE)
+    recorder.set_t0(zero_utc)
     for number, value in enumerate(degrees):
         recorder.record("temperature", (float(number), number + 1, 5000, value))
     recorder.close()
@@ -44,6 +45,16 @@ def test_a_devices_temperature_stands_beside_that_of_its_board(tmp_path):
     np.testing.assert_allclose(board.x, [1.0, 2.0, 3.0, 4.0])  # since T0, as the device's
     table = next(b for b in blocks if isinstance(b, TableBlock) and b.title.startswith("Mean"))
     assert table.rows == [[f"{MACHINE}/hat temperature", MACHINE, 36.5, 48.5, -12.0]]
+
+
+def test_a_boards_temperature_is_drawn_at_its_simulated_times_whatever_its_clock_shows(tmp_path):
+    made = SyntheticRun(tmp_path).write(health_count=0)
+    made.write_health(4, temperature_c=48.5)  # from 07:08:10 on, by the board's clock
+    measured(made, [36.0, 36.5, 37.0], zero_utc="2024-05-06T06:08:05.000Z")
+
+    board, _ = figure_of(sections_of(made)["Devices"], "Temperature of devices").choices[0].marks
+
+    np.testing.assert_allclose(board.x, [3605.0, 3606.0, 3607.0, 3608.0])
 
 
 def test_nothing_is_drawn_where_the_board_has_no_sensor_or_is_none(tmp_path):

@@ -1,17 +1,24 @@
 """What a rerun has of agents after their last ticks on record is not compared, and told."""
 
-import pytest
+import shutil
 
+import pytest
+from harness.synthetic_run import SyntheticRun
+
+from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.diff.fields import RecordPlace
 from cosmos_cli.diff.stream import Alone, StreamDifference
+from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.rerun.device_comparison import compare_devices
 from cosmos_cli.rerun.early_ends import (
     early_ends,
     leave_out_after_ends,
     leave_out_after_simulated_time,
+    leave_out_unwritten,
 )
-from cosmos_cli.rerun.recorded_run import FlownRun, RecordedAgent, UsedDevice
+from cosmos_cli.rerun.recorded_run import FlownRun, RecordedAgent, UsedDevice, read_recorded_run
+from cosmos_cli.rerun.scenario import make_rerun
 from madns_runtime.config import Agents, Recording, RunConfig, TimeSettings
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
@@ -139,3 +146,59 @@ def test_what_devices_are_given_after_their_agents_end_is_left_out_too(tmp_path,
     assert [(each.direction, each.different) for each in found] == list(
         zip(("in", "out"), differ, strict=True)
     )
+
+
+def test_of_an_agent_that_was_killed_its_last_tick_need_not_be_written_whole():
+    at_last, before = stream("b", first=33), stream("b", first=32)
+
+    remarks = leave_out_after_ends([at_last, before], {"b": 3.3}, HZ, {"b"})
+
+    assert (at_last.only_b.count, before.only_b.count) == (0, 1)
+    assert remarks == (
+        "b ended with the tick of 3.3 s: 1 record of the rerun from then on are not compared",
+    )
+
+
+def test_all_that_the_rerun_has_of_an_agent_that_wrote_no_tick_is_left_out_and_told():
+    first, other = stream("b", first=0, count=2), stream("a", first=0)
+    alone = [("state", "a"), ("state", "b"), ("orbit", "b")]
+
+    told = leave_out_after_ends([first, other], {"b": -0.1}, HZ, {"b"})
+    told += leave_out_unwritten(alone, {"b": -0.1})
+
+    assert (first.only_b.count, other.only_b.count, alone) == (0, 1, [("state", "a")])
+    assert told == (
+        "b was killed before any of its ticks was written: 2 records of the rerun are not compared",
+        "b was killed before any of its ticks was written: state, orbit of the rerun are not compared",
+    )
+
+
+def recorded_by(tmp_path, ticks, **told):
+    """Return a run in real time of two agents, of which the second wrote so many ticks, as a rerun reads it."""
+    made = SyntheticRun(tmp_path).write()
+    shutil.rmtree(made.run.path / "agents/agent-02")
+    made.write_agent("agent-02", last=ticks)
+    result = made.result()
+    result["agents"]["agent-02"] |= told
+    finish_run(made.run, result, made.expected, has_report=False)
+    return read_recorded_run(made.run, "last", None)
+
+
+@pytest.mark.parametrize(("ticks", "last_s"), [(150, 14.9), (0, -0.1)])
+def test_an_agent_that_a_fault_killed_is_flown_again_however_little_it_wrote(
+    tmp_path, ticks, last_s
+):
+    recorded = recorded_by(tmp_path, ticks, ended_on_purpose=[1])
+
+    assert recorded.killed == {"agent-02"}
+    assert recorded.agents["agent-02"].last_s == pytest.approx(last_s)
+    assert make_rerun(recorded).ends == {"agent-02": pytest.approx(last_s)}
+
+
+def test_an_agent_without_ticks_that_nobody_killed_on_purpose_is_refused(tmp_path):
+    with pytest.raises(InputError, match="agent-02: .*expected its ticks, found none"):
+        recorded_by(tmp_path, 0)
+
+
+def test_an_agent_that_lives_to_the_end_of_a_complete_run_ends_with_it(tmp_path):
+    assert make_rerun(recorded_by(tmp_path, 199)).ends == {}

@@ -296,3 +296,21 @@ def test_a_link_to_a_baseline_stays_a_link(baseline, tmp_path):
 
     assert link.is_symlink()
     assert "expected: 2" in (tmp_path / "b.yaml").read_text()
+
+
+def test_last_value_of_an_agent_is_its_last_that_is_there(baseline, tmp_path):
+    """As of a sensor that drops out at the end: a record without a value has none."""
+    made = SyntheticRun(tmp_path).write()
+    for agent, heights in (("agent-01", [900.0, None]), ("agent-02", [100.0, 200.0])):
+        recorder = made.recorder(
+            f"agents/{agent}", agent, StreamSchema("height", (Field("t_s", "s"), Field("h_m", "m")))
+        )
+        for number, height in enumerate(heights):
+            recorder.record("height", (float(number), height))
+        recorder.close()
+    gather(made.run, 10.0, lambda *told: None)
+    found = baseline("figures: {a: {stream: height, field: h_m, statistic: last, expected: 900}}")
+
+    (compared,) = compare_figures(found, made.run, {})
+
+    assert compared.got == 900.0
