@@ -171,5 +171,8 @@ def living_runs() -> list[LivingRun]:
 
 
 def in_order(entries: list[ProcessEntry]) -> tuple[ProcessEntry, ...]:
-    """Return processes as people look for them: operator, host, supervisors, agents."""
-    return tuple(sorted(entries, key=lambda e: (ROLE_ORDER.index(e.role), e.name, e.pid)))
+    """Return processes as people look for them: operator, host, supervisors, agents; last in roles of another version."""
+    ranks = {role: rank for rank, role in enumerate(ROLE_ORDER)}
+    return tuple(
+        sorted(entries, key=lambda e: (ranks.get(e.role, len(ranks)), e.role, e.name, e.pid))
+    )

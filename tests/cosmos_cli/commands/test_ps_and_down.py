@@ -111,6 +111,24 @@ def test_ps_groups_by_run_and_counts_agents(
     assert {line[-1] for line in lines[2:]} == {str(tmp_path / "runs" / "0002-b")}
 
 
+def test_role_of_another_version_is_shown_last_and_hides_nobody(
+    start: Start, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start("0002-b", "archivist", "records")
+    start("0002-b", "agent", "agent-01")
+    start("0002-b", "host", "host")
+
+    code = cosmos(["ps", "--all"])
+
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert code == 0
+    assert [line[2:4] for line in lines[1:]] == [
+        ["host", "host"],
+        ["agent", "agent-01"],
+        ["archivist", "records"],
+    ]
+
+
 def test_ps_lists_every_agent_on_request(start: Start, capsys: pytest.CaptureFixture[str]) -> None:
     pids = [start("0001-a", "agent", name).pid for name in ("agent-01", "agent-02")]
 
