@@ -90,15 +90,14 @@ def ps(
     console = Console(json=json, quiet=quiet)
     here = living_runs()
     directories = _directories(here, run)
-    targets = [source.target for each in directories for source in asked_sources(each)]
+    planned = [source.target for each in directories for source in asked_sources(each)]
     listed = _others(targets_of(inventory, limit))
-    targets += listed
     fleet = Fleetwide(
         options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
         forks=forks,
         tell=failure_teller(console),
     )
-    outcomes = fleet.look(_others(targets))
+    outcomes = fleet.look(_others(distinct(planned, listed)))
     parts = [
         part
         for part in (*_here(here), *_there(outcomes))
@@ -135,7 +134,7 @@ def _nothing_words(answered: int, has_asked: bool) -> str:
 
 
 def _others(targets: Sequence[Target]) -> list[Target]:
-    return [target for target in distinct(targets) if target.connection != "local"]
+    return [target for target in targets if target.connection != "local"]
 
 
 def _directories(here: Sequence[LivingRun], which: str | None) -> list[RunDirectory]:
@@ -157,19 +156,20 @@ def _here(runs: Sequence[LivingRun]) -> list[RunPart]:
 
 
 def _there(outcomes: Sequence[Outcome[list[Seen]]]) -> list[RunPart]:
-    found: dict[tuple[str, str, str], list[Seen]] = {}
-    for outcome in outcomes:
+    found: dict[tuple[str, str, str], dict[ProcessEntry, float]] = {}
+    for outcome in outcomes:  # a machine that is reached by two ways tells the same twice
         for seen in outcome.value or ():
-            found.setdefault((seen.entry.run, seen.machine, seen.directory), []).append(seen)
+            ages_s = found.setdefault((seen.entry.run, seen.machine, seen.directory), {})
+            ages_s[seen.entry] = seen.age_s
     return [
         RunPart(
             run,
             machine,
             directory,
-            {each.entry.pid: each.age_s for each in seen},
-            in_order([each.entry for each in seen]),
+            {entry.pid: age_s for entry, age_s in ages_s.items()},
+            in_order(list(ages_s)),
         )
-        for (run, machine, directory), seen in found.items()
+        for (run, machine, directory), ages_s in found.items()
     ]
 
 

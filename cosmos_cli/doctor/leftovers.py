@@ -44,14 +44,18 @@ def uncollected(case: Case) -> Iterator[CheckRemark]:
         str(e["run_directory"]).rpartition("/")[2] for e in case.part("cosmos").get("living") or ()
     }
     waiting = [name for name in names if name not in alive]
+    unnamed = max(
+        0, case.part("cosmos").get("run_count", 0) - len(names)
+    )  # the oldest of very many
+    count = len(waiting) + unnamed
     if waiting:
         where = "" if case.is_here else " here; `cosmos wipe --uncollected` if nobody wants them"
         yield CheckRemark(
             level=Severity.NOTE,
-            found=f"records that were not collected: {_shown(waiting)}",
+            found=f"records that were not collected: {_shown(waiting, count)}",
             cure=f"`cosmos collect RUN`{where}",
-            figure=float(len(waiting)),
-            unit="run" if len(waiting) == 1 else "runs",
+            figure=float(count),
+            unit="run" if count == 1 else "runs",
         )
 
 
@@ -91,6 +95,7 @@ def environments(case: Case) -> Iterator[CheckRemark]:
         yield CheckRemark(found="environments that are ready", figure=float(len(whole)))
 
 
-def _shown(names: Sequence[str]) -> str:
-    more = len(names) - NAMES_SHOWN_MAX
+def _shown(names: Sequence[str], count: int | None = None) -> str:
+    """Return the first of some names, and how many more there are; *count* of all where not all are known."""
+    more = (len(names) if count is None else count) - min(len(names), NAMES_SHOWN_MAX)
     return ", ".join(names[:NAMES_SHOWN_MAX]) + (f" and {more} more" if more > 0 else "")

@@ -47,6 +47,7 @@ from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.models.yaml_source import yaml_text
 from cosmos_cli.system.import_turn import IMPORT_TURN
+from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import DeviceLaunch, to_mapping
@@ -281,10 +282,12 @@ def scenario_text(scenario: ScenarioFile) -> str:
     """Return the scenario as it was run: the file itself, or with all that changed it and defaults filled in."""
     if not scenario.overrides and len(scenario.files) == 1:
         return scenario.text
-    changes = "".join(f"\n#   extends {file}" for file in scenario.files[1:])
-    changes += "".join(f"\n#   --set {override}" for override in scenario.overrides)
-    resolved = yaml_text(scenario.to_written())
-    return f"# {scenario.path.name}, with its defaults and:{changes}\n{resolved}"
+    told = [f"{scenario.path.name}, with its defaults and:"]
+    told += [f"  extends {file}" for file in scenario.files[1:]]
+    told += [f"  --set {override}" for override in scenario.overrides]
+    # A value may have several lines, and a comment has one.
+    comments = "".join(f"# {clean_line(text, length_max=None)}\n" for text in told)
+    return comments + yaml_text(scenario.to_written())
 
 
 def _finish(

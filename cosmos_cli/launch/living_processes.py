@@ -131,10 +131,18 @@ def targets_of(inventory: Sequence[str] | None, limit: str | None) -> list[Targe
     return [target_of(machine) for machine in machines_of(inventory, limit)]
 
 
-def distinct(targets: Iterable[Target]) -> list[Target]:
-    """Return each machine once: two runs, or a run and an inventory, may name the same."""
-    found = {(t.name, t.address, t.user, t.port, t.root): t for t in targets}
-    return list({target.name: target for target in found.values()}.values())
+def distinct(planned: Iterable[Target], listed: Iterable[Target] = ()) -> list[Target]:
+    """
+    Return each machine once.
+
+    Args:
+        planned: Of runs. Two that are called alike, but have different addresses, may be of two laboratories.
+        listed: Of an inventory, which knows better than an earlier run where a machine of its is.
+    """
+    listed = list(listed)
+    names = {target.name for target in listed}
+    targets = (*(target for target in planned if target.name not in names), *listed)
+    return list({(t.name, t.address, t.user, t.port, t.root): t for t in targets}.values())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,5 +179,8 @@ def living_runs() -> list[LivingRun]:
 
 
 def in_order(entries: list[ProcessEntry]) -> tuple[ProcessEntry, ...]:
-    """Return processes as people look for them: operator, host, supervisors, agents."""
-    return tuple(sorted(entries, key=lambda e: (ROLE_ORDER.index(e.role), e.name, e.pid)))
+    """Return processes as people look for them: operator, host, supervisors, agents; last in roles of another version."""
+    ranks = {role: rank for rank, role in enumerate(ROLE_ORDER)}
+    return tuple(
+        sorted(entries, key=lambda e: (ranks.get(e.role, len(ranks)), e.role, e.name, e.pid))
+    )

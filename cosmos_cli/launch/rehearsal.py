@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -174,25 +174,7 @@ class Rehearsal:
 
     def obstacles_here(self) -> list[Obstacle]:
         """Return what this computer lacks: room, a folder that can be written, a port that is free."""
-        found: list[Obstacle] = []
-        runs = self.runs.absolute()
-        folder = next(each for each in (runs, *runs.parents) if each.exists())
-        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-            found.append(
-                Obstacle(
-                    text=f"{self.runs}: {folder} cannot be written",
-                    cure="choose another folder with --runs",
-                )
-            )
-        needed = max(FREE_BYTES_MIN, self._record_bytes(self.scenario.scenario.agents.count))
-        free_bytes = shutil.disk_usage(folder).free
-        if free_bytes < needed:
-            found.append(
-                Obstacle(
-                    text=f"{self.runs}: {size_words(free_bytes)} free, {size_words(needed)} needed",
-                    cure="choose another folder with --runs",
-                )
-            )
+        found = list(self._folder_obstacles())
         port = self.scenario.scenario.network.port
         if self.plan.host is None and not self.plan.is_lockstep and _is_taken(port):
             found.append(
@@ -202,6 +184,22 @@ class Rehearsal:
                 )
             )
         return found
+
+    def _folder_obstacles(self) -> Iterator[Obstacle]:
+        """Yield what keeps records out of the folder of runs, or out of the one in which it would be made."""
+        cure = "choose another folder with --runs"
+        try:
+            folder = _made_already(self.runs.absolute())
+            free_bytes = shutil.disk_usage(folder).free
+        except OSError as error:
+            yield Obstacle(text=f"{self.runs}: {error.strerror or error}", cure=cure)
+            return
+        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+            yield Obstacle(text=f"{self.runs}: {folder} cannot be written", cure=cure)
+        needed = max(FREE_BYTES_MIN, self._record_bytes(self.scenario.scenario.agents.count))
+        if free_bytes < needed:
+            text = f"{self.runs}: {size_words(free_bytes)} free, {size_words(needed)} needed"
+            yield Obstacle(text=text, cure=cure)
 
     def _ask(
         self, connection: Connection, machine: Machine, cargo: Cargo, responder: Responder
@@ -256,6 +254,20 @@ class Rehearsal:
         scenario = self.scenario.scenario
         ticks = count_ticks(scenario.time.duration_s, scenario.agents.tick_hz)
         return ticks * agents * RECORD_BYTES_A_TICK
+
+
+def _made_already(folder: Path) -> Path:
+    """
+    Return a folder, or the nearest above it that is there.
+
+    Raises:
+        OSError: That cannot be seen, as below a folder that may not be entered.
+    """
+    for each in (folder, *folder.parents):
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            each.stat()
+            return each
+    return folder
 
 
 def _is_taken(port: int) -> bool:

@@ -32,6 +32,9 @@ class FileFact:
     mode: int | None = None
     owner: str | None = None
     group: str | None = None
+    owner_id: int | None = None
+    """The same as a number, which the inventory may name as well."""
+    group_id: int | None = None
     size_bytes: int | None = None
     sha256: str | None = None
     text: str | None = None

@@ -132,13 +132,15 @@ def _disk_write(disk: Mapping[str, PlainValue]) -> dict[str, PlainValue] | None:
 def _cosmos(asked: Mapping[str, PlainValue]) -> dict[str, PlainValue]:
     """Tell what COSMoS left or runs here."""
     environments = os.path.expanduser(str(asked.get("environments") or ""))
+    runs = _names(str(asked.get("runs") or ""))
     return {
         "has_root": os.path.isdir(os.path.expanduser(asked.get("root") or "/")),
         "living": processes(VerbRequest(arguments={"state": asked["state"]})),
-        "runs": _names(str(asked.get("runs") or "")),
+        "runs": runs[-NAMES_MAX:],
+        "run_count": len(runs),
         "environments": [
             {"name": name, "is_whole": os.path.exists(f"{environments}/{name}/{WHOLE_MARK}")}
-            for name in _names(environments)
+            for name in _names(environments)[-NAMES_MAX:]
         ],
     }
 
@@ -151,5 +153,5 @@ def _names(folder: str) -> list[str]:
             for entry in entries
             if entry.is_dir(follow_symlinks=False) and not entry.name.startswith(".")
         ]
-        return [name for _, name in sorted(found)][-NAMES_MAX:]
+        return [name for _, name in sorted(found)]
     return []

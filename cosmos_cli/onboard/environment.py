@@ -237,14 +237,10 @@ class Builder:
     def _link(self, source: str, target: str) -> str:
         path = self._room(target)
         try:
-            os.link(source, path)
+            _link_or_copy(source, path)
         except FileExistsError:  # two wheels bring one file: the later one has it, as with pip
             os.unlink(path)
-            os.link(source, path)
-        except OSError as error:
-            if error.errno not in NO_LINKS:
-                raise
-            shutil.copy2(source, path)
+            _link_or_copy(source, path)
         return target
 
     def _write(self, target: str, content: bytes, mode: int = 0o644) -> str:
@@ -261,6 +257,21 @@ class Builder:
             os.makedirs(folder, exist_ok=True)
             self._made.add(folder)
         return path
+
+
+def _link_or_copy(source: str, path: str) -> None:
+    """
+    Give a wheel's file a name in an environment as well.
+
+    Raises:
+        FileExistsError: Something has that name.
+    """
+    try:
+        os.link(source, path)
+    except OSError as error:
+        if error.errno not in NO_LINKS:
+            raise
+        shutil.copy2(source, path)
 
 
 @verb("versions")

@@ -43,6 +43,8 @@ def look_at(path: str) -> dict[str, PlainValue]:
         "mode": stat.S_IMODE(found.st_mode),
         "owner": user_name(found.st_uid),
         "group": _group_name(found.st_gid),
+        "owner_id": found.st_uid,
+        "group_id": found.st_gid,
         "size_bytes": found.st_size,
     }
 

@@ -29,7 +29,7 @@ def installed(request: VerbRequest) -> dict[str, PlainValue]:
     Tell which trees and environments are there, and really what they should be.
 
     With "touch", those are also remembered as wanted now. With "is_strict", a file that was added to an environment
-    counts as damage.
+    counts as damage. No lock is needed: what another command removes meanwhile is not there.
     """
     asked = request.arguments
     folders = {kind: content_store.expand(path) for kind, path in asked["folders"].items()}
@@ -45,9 +45,17 @@ def installed(request: VerbRequest) -> dict[str, PlainValue]:
     for kind, names in wanted.items():
         told[kind] = {name: is_whole(kind, os.path.join(folders[kind], name)) for name in names}
         for name in names if asked.get("touch") else ():
-            if told[kind][name]:
-                os.utime(os.path.join(folders[kind], name, content_store.MARK))
+            told[kind][name] = told[kind][name] and _touch(os.path.join(folders[kind], name))
     return {**told, "prunable": prunable(folders, wanted)}
+
+
+def _touch(path: str) -> bool:
+    """Remember what is whole as wanted now; False if it has gone."""
+    try:
+        os.utime(os.path.join(path, content_store.MARK))
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def is_tree_whole(path: str) -> bool:
@@ -127,8 +135,14 @@ def is_environment_whole(path: str, *, is_strict: bool) -> bool:
 
     Its hundreds of files are looked at, not read again: whoever changes a byte or a mode leaves a trace. What was added
     breaks it only when *is_strict*, and not under a living run: a package may keep something beside its code. What Python
-    compiles is nobody's.
+    compiles is nobody's. One that is removed meanwhile is not whole.
     """
+    with contextlib.suppress(FileNotFoundError):
+        return _is_environment_whole(path, is_strict=is_strict)
+    return False
+
+
+def _is_environment_whole(path: str, *, is_strict: bool) -> bool:
     mark = content_store.read_mark(path)
     if mark is None or not os.access(os.path.join(path, "bin/python"), os.X_OK):
         return False
@@ -178,8 +192,8 @@ def _newest(paths: list[str]) -> set[str]:
     by_label: dict[str, list[tuple[float, str]]] = {}
     for path in paths:
         mark = content_store.read_mark(path)
-        if mark is not None:
-            when_s = os.stat(os.path.join(path, content_store.MARK)).st_mtime
+        when_s = _changed_s(os.path.join(path, content_store.MARK))
+        if mark is not None and when_s is not None:
             by_label.setdefault(str(mark.get("label", "")), []).append((when_s, path))
     return {
         path for found in by_label.values() for _, path in sorted(found, reverse=True)[:NEWEST_KEPT]
@@ -198,8 +212,17 @@ def _orphans(folders: Mapping[str, str], gone: list[str]) -> list[str]:
         name
         for name in content_store.names_in(folders["wheels"])
         if name not in needed
-        and (
-            name in going
-            or now_s - os.stat(os.path.join(folders["wheels"], name)).st_mtime > ORPHAN_S
-        )
+        and (name in going or _is_older(os.path.join(folders["wheels"], name), now_s - ORPHAN_S))
     ]
+
+
+def _is_older(path: str, than_s: float) -> bool:
+    changed_s = _changed_s(path)
+    return changed_s is not None and changed_s < than_s
+
+
+def _changed_s(path: str) -> float | None:
+    """Return when a path was changed last, s since 1970; None of one that has gone."""
+    with contextlib.suppress(FileNotFoundError):
+        return os.stat(path).st_mtime
+    return None

@@ -223,13 +223,18 @@ def _file_changes(before: FileFact, action: FileContent, sha256: str) -> list[st
     mode = _mode(action)
     if mode is not None and mode != before.mode:
         changes.append(f"mode {before.mode or 0:04o} -> {mode:04o}")
-    for what, wanted, found in (
-        ("owner", action.owner, before.owner),
-        ("group", action.group, before.group),
+    for what, wanted, found, number in (
+        ("owner", action.owner, before.owner, before.owner_id),
+        ("group", action.group, before.group, before.group_id),
     ):
-        if wanted is not None and wanted != found:
+        if wanted is not None and not _is_called(wanted, found, number):
             changes.append(f"{what} {found} -> {wanted}")
     return changes
+
+
+def _is_called(wanted: str, name: str | None, number: int | None) -> bool:
+    """Tell whether a user or group that the inventory names, or gives the number of, is the one that was found."""
+    return wanted == name or (wanted.isdecimal() and int(wanted) == number)
 
 
 def _mode(action: FileContent) -> int | None:

@@ -43,9 +43,15 @@ def keep_small_file(folder: Path, name: str, text: str, *, count_max: int) -> No
         OSError: It cannot be written.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=folder, delete=False, encoding="utf-8") as file:
-        file.write(text)
-    os.replace(file.name, folder / name)
+    descriptor, partial = tempfile.mkstemp(dir=folder)
+    try:
+        with open(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+        os.replace(partial, folder / name)
+    except BaseException:  # a full disk has room for its name, and another one with each command
+        with contextlib.suppress(OSError):
+            os.unlink(partial)
+        raise
     with contextlib.suppress(OSError):
         kept = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
         for old in kept[count_max:]:

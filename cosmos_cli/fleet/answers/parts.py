@@ -72,6 +72,8 @@ file_fact = record(
         "mode": whole(0, 0o7777),
         "owner": name,
         "group": name,
+        "owner_id": size,
+        "group_id": size,
         "size_bytes": size,
         "sha256": sha256,
         "text": text(characters_max=FILE_CHARACTERS_MAX),

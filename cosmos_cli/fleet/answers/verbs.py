@@ -253,6 +253,7 @@ _DOCTOR: Mapping[str, Shape] = {
             "has_root": flag,
             "living": list_of(record(process)),
             "runs": names,
+            "run_count": size,
             "environments": list_of(record({"name": name, "is_whole": flag})),
         }
     ),

@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -17,7 +17,16 @@ from harness.waiting import is_alive, wait_until
 
 from cosmos_cli.app import run as cosmos
 from cosmos_cli.commands.ps import age_words
-from cosmos_cli.launch.living_processes import LivingRun, is_called, living_runs
+from cosmos_cli.evidence.run_index import remember_run
+from cosmos_cli.fleet.outcome import Outcome
+from cosmos_cli.fleet.target import Target
+from cosmos_cli.launch.living_processes import (
+    Fleetwide,
+    LivingRun,
+    Seen,
+    is_called,
+    living_runs,
+)
 from cosmos_cli.onboard import processes
 from cosmos_cli.onboard.processes import HOST_LEAD_S, end_entries
 from madns_runtime.processes import ProcessEntry
@@ -111,6 +120,24 @@ def test_ps_groups_by_run_and_counts_agents(
     assert {line[-1] for line in lines[2:]} == {str(tmp_path / "runs" / "0002-b")}
 
 
+def test_role_of_another_version_is_shown_last_and_hides_nobody(
+    start: Start, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start("0002-b", "archivist", "records")
+    start("0002-b", "agent", "agent-01")
+    start("0002-b", "host", "host")
+
+    code = cosmos(["ps", "--all"])
+
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert code == 0
+    assert [line[2:4] for line in lines[1:]] == [
+        ["host", "host"],
+        ["agent", "agent-01"],
+        ["archivist", "records"],
+    ]
+
+
 def test_ps_lists_every_agent_on_request(start: Start, capsys: pytest.CaptureFixture[str]) -> None:
     pids = [start("0001-a", "agent", name).pid for name in ("agent-01", "agent-02")]
 
@@ -132,6 +159,66 @@ def test_ps_json_holds_every_process(start: Start, capsys: pytest.CaptureFixture
     assert run["run"] == "0001-a"
     assert {process["pid"] for process in run["processes"]} == pids
     assert all(0 <= process["age_s"] < 600 for process in run["processes"])
+
+
+@pytest.fixture
+def planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Two runs that go on elsewhere, in laboratories that both call a board pi01; holds the addresses that are asked."""
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
+    asked: list[list[str]] = []
+    for name, address in (("0001-a", "192.0.2.1"), ("0002-b", "192.0.2.2")):
+        target = Target(name="pi01", address=address)
+        plan = {"machines": {"pi01": {"agents": ["a"], "target": target.to_mapping()}}}
+        plan["machines"]["pi01"]["directory"] = f"/home/pi/cosmos/runs/{name}-aabbccdd"
+        path = tmp_path / "runs" / name
+        path.mkdir(parents=True)
+        (path / "plan.json").write_text(json.dumps({**plan, "session": "aabbccdd00112233"}))
+        (path / "run.json").write_text(json.dumps({"status": "running"}))
+        remember_run(name, path)
+
+    def look(fleet: Fleetwide, targets: Iterable[Target]) -> list[Outcome[list[Seen]]]:
+        targets = list(targets)
+        asked.append([target.address for target in targets])
+        return [Outcome(machine=target.name, value=[seen_on(target)]) for target in targets]
+
+    monkeypatch.setattr(Fleetwide, "look", look)
+    return asked
+
+
+def seen_on(target: Target) -> Seen:
+    entry = ProcessEntry(
+        run="0001-a",
+        role="agent",
+        name="agent-01",
+        pid=7,
+        start_ticks=1,
+        boot_id="b",
+        node="pi01",
+        run_directory="/home/pi/cosmos/runs/0001-a-aabbccdd",
+        utc="",
+    )
+    return Seen(target.name, entry, 1.0)
+
+
+def test_machines_of_two_runs_that_are_called_alike_are_both_asked(
+    planned: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cosmos(["ps"]) == 0
+
+    told = capsys.readouterr().out
+    assert planned == [["192.0.2.1", "192.0.2.2"]]
+    assert "1 agent " in told, "what both told is one process"
+
+
+def test_inventory_knows_better_than_runs_where_a_machine_is(
+    planned: list[list[str]], tmp_path: Path
+) -> None:
+    inventory = tmp_path / "i.yaml"
+    inventory.write_text("all: {hosts: {pi01: {ansible_host: 192.0.2.3}}}\n")
+
+    assert cosmos(["ps", "-i", str(inventory)]) == 0
+
+    assert planned == [["192.0.2.3"]]
 
 
 @pytest.mark.parametrize(

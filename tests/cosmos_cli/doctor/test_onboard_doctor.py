@@ -330,3 +330,18 @@ def test_left_runs_and_half_made_environments_are_told(tmp_path: Path) -> None:
         ("whole", True),
     ]
     assert Case.of(HERE, told, Wants()).is_here
+
+
+def test_of_very_many_left_runs_the_newest_are_named_and_all_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COSMOS_STATE_DIR", f"{tmp_path}/state")
+    names = [f"{number:04d}-a-aabbccdd" for number in range(60)]
+    for age, name in enumerate(names):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        os.utime(tmp_path / "runs" / name, (1e9 + age, 1e9 + age))
+
+    told = doctor._cosmos({"runs": f"{tmp_path}/runs", "state": f"{tmp_path}/state"})
+
+    assert told["runs"] == names[10:]
+    assert told["run_count"] == 60

@@ -117,6 +117,18 @@ def test_folder_of_runs_that_is_none_is_named(place, capsys):
     assert "cannot be written" in answer["here"][0]["text"]
 
 
+def test_folder_of_runs_that_cannot_be_looked_at_is_named(place, capsys):
+    code, answer = check(capsys, "--runs", "r" * 300)
+
+    assert code == 2
+    assert answer["here"] == [
+        {
+            "text": f"{'r' * 300}: File name too long",
+            "cure": "choose another folder with --runs",
+        }
+    ]
+
+
 def test_room_for_the_records_is_asked_for(place, capsys, monkeypatch):
     monkeypatch.setattr(rehearsal, "RECORD_BYTES_A_TICK", 1e18)
 

@@ -499,6 +499,29 @@ def test_disk_without_links_gets_copies(machine, house, navlib, monkeypatch):
     assert is_whole(machine, environment)
 
 
+def test_disk_without_links_takes_a_file_that_two_wheels_bring(
+    machine, house, tmp_path, monkeypatch
+):
+    def refuse(source, target):  # as Linux does, which looks at the name first
+        number = errno.EEXIST if os.path.lexists(target) else errno.EXDEV
+        raise OSError(number, os.strerror(number), target)
+
+    environment = house.environment(
+        make_wheel(tmp_path / "made", "first", files={"shared/note.txt": b"of the first"}),
+        make_wheel(tmp_path / "made", "second", files={"shared/note.txt": b"of the second"}),
+    )
+    install(machine, environment)
+    given = next(given for verb, given, _ in machine.calls if verb == "environment")
+    shutil.rmtree(top_of(machine, environment))
+    monkeypatch.setattr(os, "link", refuse)
+
+    build(VerbRequest(arguments=given, body=b""))
+
+    (note,) = top_of(machine, environment).rglob("note.txt")
+    assert note.read_bytes() == b"of the second"
+    assert is_whole(machine, environment)
+
+
 def test_prune_spares_the_wanted_the_newest_and_the_used(machine, house, tmp_path):
     environments = []
     for index in range(6):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from dataclasses import dataclass
 
 import pytest
@@ -9,6 +10,8 @@ from provision_machines import CASES, HOME, facts_of, told, wanted
 
 from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.models.machine_facts import MachineFacts
+from cosmos_cli.onboard.facts import _file
+from cosmos_cli.onboard.files import replace_file
 from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, notes_of, plan_steps
 from cosmos_cli.provision.up import MachineUp, UpOptions
 from cosmos_cli.provision.up_table import MachineResult
@@ -50,6 +53,23 @@ class FakeTree:
     hash: str = "0123456789abcdef"
     files: tuple = ("a", "b", "c")
     size_bytes: int = 1_000_000
+
+
+@pytest.mark.parametrize("zeros", ["", "00"])
+def test_file_whose_owner_is_named_by_number_is_left_when_it_is_so(tmp_path, zeros):
+    path, uid, gid = str(tmp_path / "a"), os.getuid(), os.getgid()
+    owners = {"owner": f"{zeros}{uid}", "group": f"{zeros}{gid}"}
+    replace_file(path, b"x", owners)
+    facts = facts_of(files={path: _file(path, "hash")})
+
+    wants = wanted(provision=[{"file": {"dest": path, "content": "x", **owners}}])
+    others = wanted(
+        provision=[{"file": {"dest": path, "content": "x", "owner": "4242", "group": "4243"}}]
+    )
+
+    assert plan_steps(facts, wants) == ()
+    (step,) = plan_steps(facts, others)
+    assert step.title.endswith("-> 4243") and ": owner " in step.title
 
 
 def test_environment_and_trees_that_are_not_there_come_after_what_they_need():

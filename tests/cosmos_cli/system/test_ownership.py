@@ -4,12 +4,13 @@ import os
 import socket
 
 import pytest
+from harness import full_disk
 
 from cosmos_cli.evidence.run_index import index_directory, remembered_runs
 from cosmos_cli.fleet import target_cache
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.system import ownership
-from cosmos_cli.system.ownership import read_own_file
+from cosmos_cli.system.ownership import keep_small_file, read_own_file
 
 
 def test_own_file_is_read_up_to_its_bound(tmp_path):
@@ -19,6 +20,19 @@ def test_own_file_is_read_up_to_its_bound(tmp_path):
     assert read_own_file(path, bytes_max=5) == b"12345"
     with pytest.raises(OSError, match="at most 4 bytes"):
         read_own_file(path, bytes_max=4)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_full"), [("kept", True), ("\ud800", False)], ids=["no name", "no content"]
+)
+def test_what_cannot_be_kept_leaves_nothing_behind(tmp_path, monkeypatch, text, is_full):
+    if is_full:
+        monkeypatch.setattr(os, "replace", full_disk.refuse)
+
+    with pytest.raises((OSError, UnicodeEncodeError)):
+        keep_small_file(tmp_path, "a", text, count_max=2)
+
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_another_users_file_is_not_believed(tmp_path, monkeypatch):

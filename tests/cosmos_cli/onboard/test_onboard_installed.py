@@ -1,0 +1,75 @@
+"""What is installed is told without a lock: another command may remove it at any moment."""
+
+import os
+import shutil
+
+import pytest
+
+from cosmos_cli.onboard import content_changes, content_store
+from cosmos_cli.onboard import installed as module
+from cosmos_cli.onboard.installed import installed
+from cosmos_cli.onboard.request_loop import VerbRequest
+
+KINDS = ("trees", "environments", "wheels")
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Everything that is there is called `one`, and is whole."""
+    for kind in KINDS:
+        program = tmp_path / kind / "one" / "bin" / "python"
+        program.parent.mkdir(parents=True)
+        program.write_text("")
+        program.chmod(0o755)
+        top = str(tmp_path / kind / "one")
+        traces = content_store.trace(top, ["bin/python"])
+        content_changes.mark_complete(top, {"files": traces, "label": "one", "wheels": []})
+    return {kind: str(tmp_path / kind) for kind in KINDS}
+
+
+def ask(folders, *environments):
+    asked = {"folders": folders, "trees": [], "environments": environments}
+    return installed(VerbRequest(arguments={**asked, "touch": True, "is_strict": True}))
+
+
+def removing(monkeypatch, module, name, kind, folders):
+    """Let another command remove what is there of a kind as soon as a function has answered about it."""
+    function = getattr(module, name)
+
+    def answer(*arguments, **named):
+        answered = function(*arguments, **named)
+        if arguments[0].startswith(folders[kind]):
+            shutil.rmtree(os.path.join(folders[kind], "one"), ignore_errors=True)
+        return answered
+
+    monkeypatch.setattr(module, name, answer)
+
+
+def test_environment_that_is_there_is_told(folders):
+    assert ask(folders, "one")["environments"] == {"one": True}
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [
+        (content_store, "read_mark"),
+        (content_store, "is_untouched"),
+        (module, "is_environment_whole"),
+    ],
+)
+def test_environment_that_is_removed_meanwhile_is_not_there(folders, monkeypatch, place, name):
+    removing(monkeypatch, place, name, "environments", folders)
+
+    assert ask(folders, "one")["environments"] == {"one": False}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["read_mark", "names_in"])
+def test_what_nobody_asks_for_and_is_removed_meanwhile_is_no_error(
+    folders, monkeypatch, kind, name
+):
+    removing(monkeypatch, content_store, name, kind, folders)
+
+    told = ask(folders)
+
+    assert told["prunable"]["wheels"] == []
