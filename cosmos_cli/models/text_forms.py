@@ -34,6 +34,22 @@ def like(pattern: str, expected: str) -> BeforeValidator:
     return BeforeValidator(check)
 
 
+def compile_expression(text: str) -> re.Pattern[str]:
+    """
+    Compile a regular expression that a person wrote.
+
+    Raises:
+        ValueError: It is none, or too large for Python.
+    """
+    try:
+        return re.compile(text)
+    except RecursionError:
+        why = "its brackets are nested too deeply"
+    except (re.error, OverflowError) as error:
+        why = str(error)
+    raise ValueError(f"not a regular expression: {why}")
+
+
 def _has_items(value: Any) -> Any:
     if isinstance(value, list | tuple) and not value:
         raise ValueError("expected at least one item")
