@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +14,8 @@ from pydantic import TypeAdapter
 
 from cosmos_cli import app
 from cosmos_cli.commands import command_group
-from cosmos_cli.commands.init import render
-from cosmos_cli.errors import ExitCode, RunFailedError
+from cosmos_cli.commands.init import render, write_new
+from cosmos_cli.errors import ExitCode, InputError, RunFailedError
 from cosmos_cli.launch.feasibility import Resources, judge
 from cosmos_cli.launch.plan_view import verdict_words
 from cosmos_cli.models import parameters, scenario_outline, timeline
@@ -455,6 +456,27 @@ def test_init_overwrites_nothing(cosmos):
     assert err.startswith("error: rover.py exists already and is left as it is")
     assert Path("rover.py").read_text() == "mine\n"
     assert not Path("rover.yaml").exists()
+
+
+def test_init_says_that_a_folder_cannot_be_called_so(cosmos):
+    code, _, err = cosmos("init", "rover", "-d", "x" * 300)
+
+    assert code == ExitCode.BAD_INPUT
+    assert err == f"error: {'x' * 300}/rover.yaml: cannot be written: File name too long\n"
+
+
+def test_init_names_the_file_that_a_disk_does_not_take_and_leaves_no_half(tmp_path):
+    own = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, own[1]))  # bytes; stands in for a full disk
+    try:
+        with pytest.raises(InputError) as refused:
+            write_new({Path("a.py"): "x = 1\n", Path("a.yaml"): "x" * 100}, tmp_path / "new")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, own)
+
+    expected = f"{tmp_path}/new/a.yaml: cannot be written: File too large"
+    assert expected == str(refused.value)
+    assert os.listdir(tmp_path / "new") == []
 
 
 @pytest.mark.parametrize("name", ["Rover", "../x", "a b", "-x"])
