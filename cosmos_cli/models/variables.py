@@ -157,8 +157,10 @@ class _Variables:
         """Return a variable's value as it stands in a longer text: as it is written."""
         if isinstance(value, str):
             return value
-        written = self._document.texts.get((SECTION, name))
-        return written if written is not None and "${" not in written else kind_of(value)
+        made_of = self.written[name]
+        if isinstance(made_of, str):  # ${x} alone, as its value is no text
+            return self.text_of(made_of[2:-1], value)
+        return self._document.texts.get((SECTION, name)) or kind_of(value)
 
     def hint(self, word: str, more: tuple[str, ...] = ()) -> str:
         """Return what was meant by a word that no variable is named."""
