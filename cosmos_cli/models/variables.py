@@ -314,11 +314,12 @@ def texts_with_words(
     document: Document, placeholders: Mapping[str, tuple[str, ...]]
 ) -> frozenset[Path]:
     """Return the texts that the simulation reads for words of its own."""
-    return frozenset(path for path in document.open_texts if _words_at(path, placeholders))
+    return frozenset(path for path in document.open_texts if words_at(path, placeholders))
 
 
-def _words_at(path: Path, placeholders: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    below = path[1:] if path[0] == "parameters" else path[3:]
+def words_at(path: Path, placeholders: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the words that the simulation reads at a place of its parameters, or of those of a rule."""
+    below = path[1:] if path[:1] == ("parameters",) else path[3:]
     field = ".".join(step for step in below if isinstance(step, str))
     fits = [words for glob, words in placeholders.items() if fnmatch.fnmatchcase(field, glob)]
     return tuple(word for words in fits for word in words)
@@ -327,7 +328,7 @@ def _words_at(path: Path, placeholders: Mapping[str, tuple[str, ...]]) -> tuple[
 def _judge(
     document: Document, path: Path, placeholders: Mapping[str, tuple[str, ...]]
 ) -> Iterator[Fault]:
-    known = _words_at(path, placeholders)
+    known = words_at(path, placeholders)
     holder: Any = document.value
     for step in path[:-1]:
         holder = holder[step]
