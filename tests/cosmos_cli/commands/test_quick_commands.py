@@ -458,6 +458,29 @@ def test_init_overwrites_nothing(cosmos):
     assert not Path("rover.yaml").exists()
 
 
+@pytest.mark.parametrize(
+    "words", [("--", "ip", "--json"), ("ip", "--json"), ("-l", "--json", "ip")]
+)
+def test_the_json_of_a_command_that_exec_runs_is_not_its_own(cosmos, words):
+    Path("box.yaml").write_text("all:\n  hosts: {pi01: {cosmos_rot: x}}\n")
+
+    code, out, err = cosmos("exec", "-i", "box.yaml", *words)
+
+    assert (code, out) == (ExitCode.BAD_INPUT, "")
+    assert "cosmos_rot: unknown variable" in err
+    _, out, _ = cosmos("exec", "-i", "box.yaml", "--json", *words)
+    assert json.loads(out)["exit_code"] == ExitCode.BAD_INPUT
+
+
+@pytest.mark.parametrize("arguments", [("vlidate", "--json"), ("validate", "--json", "--jsn")])
+def test_an_error_before_a_command_is_known_is_json_if_asked_for(cosmos, arguments):
+    cosmos("exec", "-i", "a.yaml", "true")
+
+    _, out, _ = cosmos(*arguments)
+
+    assert json.loads(out)["error"]["kind"] == "usage"
+
+
 def test_init_says_that_a_folder_cannot_be_called_so(cosmos):
     code, _, err = cosmos("init", "rover", "-d", "x" * 300)
 
