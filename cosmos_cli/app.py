@@ -19,6 +19,7 @@ import typer
 
 from cosmos_cli.commands.command_group import USAGE_ERROR, LazyGroup
 from cosmos_cli.errors import CosmosError, ExitCode, InputError, describe, in_one_line
+from cosmos_cli.ui import invocation
 from cosmos_cli.ui.console import (
     Console,
     OutputLost,
@@ -99,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def run(arguments: list[str]) -> int:
     """Run the command line and return its exit code; every error has become text by then."""
-    wants_json = "--json" in arguments
+    invocation.forget()
     try:
         code = typer.main.get_command(make_app()).main(
             arguments, prog_name="cosmos", standalone_mode=False
@@ -109,16 +110,16 @@ def run(arguments: list[str]) -> int:
         return _report(
             describe(error),
             _with_arguments_in_one_line(str(error), arguments),
-            wants_json,
+            _wants_json(arguments),
             bare=bool(isinstance(error, InputError) and error.faults),
         )
     except CLICK_ERROR as error:
-        return _report_usage(error, wants_json)
+        return _report_usage(error, _wants_json(arguments))
     except (KeyboardInterrupt, typer.Abort):
         return _report(
             _plain("interrupted", "interrupted", int(ExitCode.INTERRUPTED)),
             "interrupted",
-            wants_json,
+            _wants_json(arguments),
             bare=True,
         )
     except BrokenPipeError:
@@ -131,7 +132,16 @@ def run(arguments: list[str]) -> int:
         tell_lost_output(error)
         return int(ExitCode.RUN_FAILED)
     except Exception as error:  # noqa: BLE001 - the last seam: a defect of ours still ends in one line
-        return _report_unexpected(error, wants_json)
+        return _report_unexpected(error, _wants_json(arguments))
+
+
+def _wants_json(arguments: Sequence[str]) -> bool:
+    """Tell whether --json was asked for; before the command's words are understood, whether they seem to."""
+    current = invocation.current()
+    if current is not invocation.NOTHING:
+        return current.has_option("--json")
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    return "--json" in arguments[:end]
 
 
 def _plain(kind: str, message: str, exit_code: int) -> dict[str, Any]:

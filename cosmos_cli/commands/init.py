@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import keyword
 import re
 import shlex
 import sys
+from collections.abc import Sequence
 from enum import StrEnum
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -127,22 +129,31 @@ def write_new(files: dict[Path, str], directory: Path) -> list[Path]:
     Write files that must not exist yet.
 
     Raises:
-        InputError: One of them exists, in which case none is written, or the folder refuses.
+        InputError: One of them exists, or the folder refuses; none is left then.
     """
-    existing = [str(directory / path) for path in files if (directory / path).exists()]
+    written: list[Path] = []
+    target = directory
+    try:
+        _refuse_existing([directory / path for path in files])
+        for path, text in files.items():
+            target = directory / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with target.open("x", encoding="utf-8") as file:
+                written.append(target)
+                file.write(text)
+    except OSError as error:
+        for path in written:  # half of a template would be in the way of the next try
+            with contextlib.suppress(OSError):
+                path.unlink()
+        where = error.filename or target  # of a full disk no error names the file
+        raise InputError(f"{where}: cannot be written: {error.strerror}") from error
+    return written
+
+
+def _refuse_existing(paths: Sequence[Path]) -> None:
+    existing = [str(path) for path in paths if path.exists()]
     if existing:
         raise InputError(
             f"{', '.join(existing)} exists already and is left as it is; "
             "choose another NAME or --directory"
         )
-    written = []
-    try:
-        for path, text in files.items():
-            target = directory / path
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with target.open("x", encoding="utf-8") as file:
-                file.write(text)
-            written.append(target)
-    except OSError as error:
-        raise InputError(f"{error.filename}: cannot be written: {error.strerror}") from error
-    return written

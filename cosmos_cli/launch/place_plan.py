@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import ScenarioFile
-from cosmos_cli.models.place_uses import CURE, shared_places
+from cosmos_cli.models.place_uses import cure_of, shared_places
 
 if TYPE_CHECKING:  # `cosmos validate` plans nothing, and a plan's imports would double its own
     from cosmos_cli.launch.plan import LaunchPlan
@@ -21,7 +21,9 @@ def check_places(scenario_file: ScenarioFile, plan: LaunchPlan) -> None:
         InputError: With every fault.
     """
     faults = [
-        scenario_file.fault_of(f"{field}: {text} (here {computer}); {CURE}")
+        scenario_file.fault_of(
+            f"{field}: {text} (here {computer}); {cure_of(field, scenario_file.placeholders)}"
+        )
         for computer, agents in _agents_by_computer(plan)
         for field, text in shared_places(scenario_file.place_uses, agents)
     ]
@@ -33,7 +35,9 @@ def place_notes(scenario_file: ScenarioFile) -> list[str]:
     """Return what only the machines of a run can tell: places that agents must not share, but on machines of their own."""
     names = scenario_file.scenario.agents.resolved_names()
     return [
-        scenario_file.fault_of(f"{field}: {text}; {CURE}").render()
+        scenario_file.fault_of(
+            f"{field}: {text}; {cure_of(field, scenario_file.placeholders)}"
+        ).render()
         for field, text in shared_places(scenario_file.place_uses, names)
     ]
 

@@ -141,9 +141,9 @@ def read_document(source: YamlSource, *, has_64_bits: bool = True) -> Document:
     return document
 
 
-def read_value(source: YamlSource) -> tuple[Any, list[Fault]]:
+def read_value(source: YamlSource) -> tuple[Any, str, list[Fault]]:
     """
-    Return what a text means that is any value, and its faults.
+    Return what a text means that is any value, the scalar as it is written if it is a plain one, and its faults.
 
     Raises:
         InputError: It is no YAML.
@@ -151,7 +151,7 @@ def read_value(source: YamlSource) -> tuple[Any, list[Fault]]:
     root = compose(source)
     builder = _Builder(Document(source))
     value = builder.build(root, ()) if root else None
-    return value, builder.faults + builder.document.faults
+    return value, builder.document.texts.get((), ""), builder.faults + builder.document.faults
 
 
 def kind_of(value: Any) -> str:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, InputError
 from cosmos_cli.models.document import did_you_mean, may_guess
 from cosmos_cli.models.limit_file import MARK, file_patterns, has_stray_bracket, pieces_of
+from cosmos_cli.models.text_forms import compile_expression
 
 if TYPE_CHECKING:
     from cosmos_cli.models.inventory.machine import Machine
@@ -168,9 +169,10 @@ class _Matcher:
         if text[0] != "~" and not _is_glob(text):
             return [text] * (text in self.groups), [text] * (text in self.machines)
         try:
-            fits = re.compile(text[1:] if text[0] == "~" else fnmatch.translate(text)).match
-        except re.error as error:
-            self.faults.append(f"{text}: not a regular expression: {error}")
+            written = text[1:] if text[0] == "~" else fnmatch.translate(text)
+            fits = compile_expression(written).match
+        except ValueError as error:
+            self.faults.append(f"{text}: {error}")
             self.broken.add(text)
             return [], []
         return list(filter(fits, self.groups)), list(filter(fits, self.machines))

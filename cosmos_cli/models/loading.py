@@ -23,7 +23,7 @@ from cosmos_cli.models.hardware import hardware_faults
 from cosmos_cli.models.known_streams import KnownDevice, KnownStreams
 from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.own_requirements import own_requirement_faults
-from cosmos_cli.models.place_uses import CURE, shared_places
+from cosmos_cli.models.place_uses import cure_of, shared_places
 from cosmos_cli.models.plugin_answers import ask_plugin
 from cosmos_cli.models.plugin_demand import ask_plugin_demand
 from cosmos_cli.models.scenario import OF_AUTHORS, Scenario, cross_faults
@@ -226,7 +226,10 @@ def _check(
         if scenario.time.is_lockstep:  # all on this computer
             names = scenario.agents.resolved_names()
             faults += [
-                fault_found_at(document, f"{field}: {text}; {CURE}")
+                fault_found_at(
+                    document,
+                    f"{field}: {text}; {cure_of(field, answers.placeholders, has_machines=False)}",
+                )
                 for field, text in shared_places(answers.place_uses, names)
             ]
     faults += [

@@ -27,9 +27,11 @@ def apply_overrides(document: Document, overrides: Sequence[str]) -> list[Fault]
         return [Fault(text=text, override=overrides[OVERRIDES_MAX].partition("=")[0])]
     for override in overrides:
         try:
-            key, path, value = parse_override(override)
+            key, path, value, text = _parsed(override)
             _refuse_replacing(key, path, seen)
-            set_value(document, key, path, value)
+            written = _set_value(document, key, path, value)
+            if text:
+                document.texts[written] = text
         except InputError as error:
             faults += error.faults
     return faults
@@ -59,6 +61,11 @@ def parse_override(override: str) -> tuple[str, Path, Any]:
     Raises:
         InputError: There is no '=', the key is no dotted path, or the value no YAML.
     """
+    return _parsed(override)[:3]
+
+
+def _parsed(override: str) -> tuple[str, Path, Any, str]:
+    """Return key, path and value of KEY=VALUE, and the value as it is written if it is a plain scalar."""
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals:
@@ -73,17 +80,17 @@ def parse_override(override: str) -> tuple[str, Path, Any]:
         for name, index in _STEP.findall(key)
     )
     try:
-        value, faults = read_value(YamlSource.of("", text))
+        value, written, faults = read_value(YamlSource.of("", text))
     except InputError as error:
         raise _override_error(key, error.faults[0].text) from None
     if faults:
         raise _override_error(key, faults[0].text)
-    return key, path, value
+    return key, path, value, written
 
 
-def set_value(document: Document, key: str, path: Path, value: Any) -> None:
+def _set_value(document: Document, key: str, path: Path, value: Any) -> Path:
     """
-    Replace the value at *path* by that of *key*; what stood below it is forgotten.
+    Replace the value at *path* by that of *key*, and return the path in the document's terms; what stood below is forgotten.
 
     Raises:
         InputError: There is no such place.
@@ -96,6 +103,7 @@ def set_value(document: Document, key: str, path: Path, value: Any) -> None:
     for places in (document.value_places, document.key_places, document.texts):
         _forget(places, written)
     document.value_places[written] = document.key_places[written] = SourcePlace(override=key)
+    return written
 
 
 def _forget(places: dict[Path, Any], path: Path) -> None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
 
 from cosmos_cli.models.device_uses import named_agents
+from cosmos_cli.models.fault_place import path_named
+from cosmos_cli.models.variables import words_at
 from madns_runtime.plugin.api import PlaceUse
+
+WORDS_NAMED_MAX: Final = 2
 
 
 def shared_places(uses: Sequence[PlaceUse], agents: Iterable[str]) -> list[tuple[str, str]]:
@@ -29,5 +34,19 @@ def shared_places(uses: Sequence[PlaceUse], agents: Iterable[str]) -> list[tuple
     ]
 
 
-CURE = "${name} or ${index} in it tells them apart; so do machines of their own"
-"""Of what the parameters of agents have in common."""
+def cure_of(
+    field: str, placeholders: Mapping[str, tuple[str, ...]], *, has_machines: bool = True
+) -> str:
+    """
+    Return what tells apart the places that a parameter gives several agents.
+
+    Args:
+        field: Dotted name of the parameter.
+        placeholders: Words that the simulation replaces per agent, by field.
+        has_machines: Whether agents may run on machines of their own.
+    """
+    words = words_at(path_named(field), placeholders)[:WORDS_NAMED_MAX]
+    own = "agent_parameters, where the simulation lets it differ, tells them apart"
+    if words:
+        own = f"{' or '.join(f'${{{word}}}' for word in words)} in it tells them apart"
+    return f"{own}; so do machines of their own" if has_machines else own

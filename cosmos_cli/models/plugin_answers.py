@@ -210,6 +210,7 @@ class _Asking:
                     of_all=of_all.parameters or {},
                 )
             self._faults += [fault for fault in asking._faults if fault not in self._faults]
+            self._remarks += [each for each in asking._remarks if each not in self._remarks]
             self._omitted += asking._omitted
         return found
 

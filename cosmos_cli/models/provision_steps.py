@@ -7,7 +7,6 @@ A step says what should be, never how to get there; the plan of `cosmos up` comp
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,6 +20,7 @@ from cosmos_cli.models.text_forms import (
     NonBlank,
     SystemPackage,
     SystemUser,
+    compile_expression,
     like,
 )
 from madns_runtime.bounded_files import FileRefused, check_regular_file
@@ -199,9 +199,9 @@ def _line_faults(line: Mapping[str, Any], folder: Path) -> Iterator[StepFault]:
     if not isinstance(regexp, str):
         return
     try:
-        found = re.compile(regexp)
-    except re.error as error:
-        yield ("regexp",), f"not a regular expression: {error}"
+        found = compile_expression(regexp)
+    except ValueError as error:
+        yield ("regexp",), str(error)
         return
     is_present = line.get("state", "present") == "present"
     if is_present and isinstance(text, str) and not found.search(text):

@@ -105,7 +105,7 @@ class AwaitedRule(FieldRule):
     """Condition that is waited for in the records of some agents."""
 
     agents: tuple[NonBlank, ...] = ()
-    """Names, labels or globs of agents; host for the host's half. Not given: all who record it."""
+    """Names, labels or globs of agents; host for the host's half. Not given: all agents, or the host's half where it alone records the stream."""
     for_s: Annotated[float, Ge(0)] = 0.0
     """How long it must have held, s."""
 

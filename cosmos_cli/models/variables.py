@@ -157,8 +157,10 @@ class _Variables:
         """Return a variable's value as it stands in a longer text: as it is written."""
         if isinstance(value, str):
             return value
-        written = self._document.texts.get((SECTION, name))
-        return written if written is not None and "${" not in written else kind_of(value)
+        made_of = self.written[name]
+        if isinstance(made_of, str):  # ${x} alone, as its value is no text
+            return self.text_of(made_of[2:-1], value)
+        return self._document.texts.get((SECTION, name)) or kind_of(value)
 
     def hint(self, word: str, more: tuple[str, ...] = ()) -> str:
         """Return what was meant by a word that no variable is named."""
@@ -312,11 +314,12 @@ def texts_with_words(
     document: Document, placeholders: Mapping[str, tuple[str, ...]]
 ) -> frozenset[Path]:
     """Return the texts that the simulation reads for words of its own."""
-    return frozenset(path for path in document.open_texts if _words_at(path, placeholders))
+    return frozenset(path for path in document.open_texts if words_at(path, placeholders))
 
 
-def _words_at(path: Path, placeholders: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    below = path[1:] if path[0] == "parameters" else path[3:]
+def words_at(path: Path, placeholders: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the words that the simulation reads at a place of its parameters, or of those of a rule."""
+    below = path[1:] if path[:1] == ("parameters",) else path[3:]
     field = ".".join(step for step in below if isinstance(step, str))
     fits = [words for glob, words in placeholders.items() if fnmatch.fnmatchcase(field, glob)]
     return tuple(word for words in fits for word in words)
@@ -325,7 +328,7 @@ def _words_at(path: Path, placeholders: Mapping[str, tuple[str, ...]]) -> tuple[
 def _judge(
     document: Document, path: Path, placeholders: Mapping[str, tuple[str, ...]]
 ) -> Iterator[Fault]:
-    known = _words_at(path, placeholders)
+    known = words_at(path, placeholders)
     holder: Any = document.value
     for step in path[:-1]:
         holder = holder[step]

@@ -224,6 +224,8 @@ def open_standard_streams() -> None:
             os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # the lowest free number: this one
+    if streams.stdin is None:
+        streams.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115 - as long as the process
     if streams.stdout is None:
         streams.stdout = ClosedOutput()
     if streams.stderr is None:

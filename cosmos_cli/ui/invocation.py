@@ -24,6 +24,19 @@ class Invocation:
         """Return the command line for a shell, with this --limit in place of its own."""
         return shlex.join(["cosmos", self.verb, "--limit", pattern, *self._without_limit()])
 
+    def has_option(self, name: str) -> bool:
+        """Tell whether an option is given to the verb: neither to what `exec` runs, nor as the value of another option."""
+        words = iter(self.words)
+        for word in words:
+            if word == "--" or (self.has_tail and not word.startswith("-")):
+                return False
+            option, is_attached = self._option(word)
+            if option == name:
+                return True
+            if option in self.valued and not is_attached:
+                next(words, None)
+        return False
+
     def _without_limit(self) -> Iterator[str]:
         words = iter(self.words)
         for word in words:
@@ -48,7 +61,14 @@ class Invocation:
         return word[:2], len(word) > 2
 
 
-_current = Invocation(verb="")
+NOTHING = Invocation(verb="")
+_current = NOTHING
+
+
+def forget() -> None:
+    """Begin another command line, of which nothing is read yet."""
+    global _current  # noqa: PLW0603 - a process carries out one command line
+    _current = NOTHING
 
 
 def record(verb: str, words: Sequence[str], valued: frozenset[str], *, has_tail: bool) -> None:
@@ -58,5 +78,5 @@ def record(verb: str, words: Sequence[str], valued: frozenset[str], *, has_tail:
 
 
 def current() -> Invocation:
-    """Return the command line that is being carried out."""
+    """Return the command line that is being carried out; NOTHING before its words are understood."""
     return _current

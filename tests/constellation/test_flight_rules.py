@@ -294,11 +294,13 @@ def test_a_shared_place_is_a_fault_where_all_run_here_and_a_note_where_machines_
     lockstep = {"time": {"mode": "lockstep", "duration_s": 3}}
     (fault,) = read_scenario_faults(tmp_path, {"flight": flight}, **lockstep)
     assert words in fault and "${name} or ${index} in it tells them apart" in fault
+    assert "machines of their own" not in fault  # which lockstep has not
 
     write_scenario(tmp_path, {"flight": flight})
     scenario_file = load_scenario(tmp_path / "scenario.yaml")
     (note,) = place_notes(scenario_file)
     assert words in note and "scenario.yaml:" in note
+    assert "${name} or ${index} in it tells them apart; so do machines of their own" in note
     with pytest.raises(InputError, match=r"one machine \(here this computer\)"):
         check_places(scenario_file, make_plan(scenario_file.scenario))
     boards = [Machine(name=name, address=name, variables=Variables()) for name in ("pi01", "pi02")]

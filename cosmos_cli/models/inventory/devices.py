@@ -82,14 +82,16 @@ def device_kind_faults(
         folder: The inventory's, from which files are found.
     """
     faults = []
-    seen: set[str] = set()
+    seen: dict[str, bool] = {}
+    """Whether a mapping has said what the device is, by name: labels alone may come again."""
     questions = []
     for index, each in enumerate(listed or ()):
-        name = each if isinstance(each, str) else each["name"]
-        if name in seen and not isinstance(each, str):
+        is_label = isinstance(each, str)
+        name = each if is_label else each["name"]
+        if name in seen and (seen[name] or not is_label):
             faults.append(document.fault((*path, index), f"{name} is listed already"))
-        seen.add(name)
-        if not isinstance(each, str):
+        seen[name] = seen.get(name, False) or not is_label
+        if not is_label:
             parameters = each.get("parameters") or {}
             questions.append(
                 DeviceQuestion(

@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +14,8 @@ from pydantic import TypeAdapter
 
 from cosmos_cli import app
 from cosmos_cli.commands import command_group
-from cosmos_cli.commands.init import render
-from cosmos_cli.errors import ExitCode, RunFailedError
+from cosmos_cli.commands.init import render, write_new
+from cosmos_cli.errors import ExitCode, InputError, RunFailedError
 from cosmos_cli.launch.feasibility import Resources, judge
 from cosmos_cli.launch.plan_view import verdict_words
 from cosmos_cli.models import parameters, scenario_outline, timeline
@@ -455,6 +456,50 @@ def test_init_overwrites_nothing(cosmos):
     assert err.startswith("error: rover.py exists already and is left as it is")
     assert Path("rover.py").read_text() == "mine\n"
     assert not Path("rover.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    "words", [("--", "ip", "--json"), ("ip", "--json"), ("-l", "--json", "ip")]
+)
+def test_the_json_of_a_command_that_exec_runs_is_not_its_own(cosmos, words):
+    Path("box.yaml").write_text("all:\n  hosts: {pi01: {cosmos_rot: x}}\n")
+
+    code, out, err = cosmos("exec", "-i", "box.yaml", *words)
+
+    assert (code, out) == (ExitCode.BAD_INPUT, "")
+    assert "cosmos_rot: unknown variable" in err
+    _, out, _ = cosmos("exec", "-i", "box.yaml", "--json", *words)
+    assert json.loads(out)["exit_code"] == ExitCode.BAD_INPUT
+
+
+@pytest.mark.parametrize("arguments", [("vlidate", "--json"), ("validate", "--json", "--jsn")])
+def test_an_error_before_a_command_is_known_is_json_if_asked_for(cosmos, arguments):
+    cosmos("exec", "-i", "a.yaml", "true")
+
+    _, out, _ = cosmos(*arguments)
+
+    assert json.loads(out)["error"]["kind"] == "usage"
+
+
+def test_init_says_that_a_folder_cannot_be_called_so(cosmos):
+    code, _, err = cosmos("init", "rover", "-d", "x" * 300)
+
+    assert code == ExitCode.BAD_INPUT
+    assert err == f"error: {'x' * 300}/rover.yaml: cannot be written: File name too long\n"
+
+
+def test_init_names_the_file_that_a_disk_does_not_take_and_leaves_no_half(tmp_path):
+    own = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, own[1]))  # bytes; stands in for a full disk
+    try:
+        with pytest.raises(InputError) as refused:
+            write_new({Path("a.py"): "x = 1\n", Path("a.yaml"): "x" * 100}, tmp_path / "new")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, own)
+
+    expected = f"{tmp_path}/new/a.yaml: cannot be written: File too large"
+    assert expected == str(refused.value)
+    assert os.listdir(tmp_path / "new") == []
 
 
 @pytest.mark.parametrize("name", ["Rover", "../x", "a b", "-x"])

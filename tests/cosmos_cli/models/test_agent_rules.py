@@ -3,6 +3,7 @@
 import pytest
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.launch.place_plan import place_notes
 from cosmos_cli.models.loading import load_scenario
 from madns_runtime.config import RunConfig, from_mapping, to_mapping
 from madns_runtime.plugin.half import RoleProgram
@@ -122,6 +123,39 @@ def test_what_a_rule_makes_agents_declare_and_take_is_theirs(load):
         "agent-2": "port 0",
         "agent-3": "port 7",
     }
+
+
+@pytest.mark.process
+def test_what_is_odd_in_a_rule_is_remarked_at_the_rule_and_of_all_once(load, tmp_path):
+    (tmp_path / "plug.py").write_text(
+        PLUGIN.replace(
+            "def check(parameters, agents, base_directory):\n    return ",
+            "def check(parameters, agents, base_directory):\n"
+            "    odd = [f'remark: engine.power_w: {parameters.engine.power_w:g} is much',"
+            " 'remark: mass_kg: is odd']\n    return odd if parameters.engine.power_w > 15 else ",
+        )
+    )
+
+    found = load(OWN + "  - {agents: [agent-3], parameters: {engine: {power_w: 30}}}\n")
+
+    assert [(each.line, each.path, each.text) for each in found.remarks] == [
+        (4, "parameters.engine.power_w", "20 is much"),
+        (4, "parameters.mass_kg", "is odd"),
+        (6, "agent_parameters[0].parameters.engine.power_w", "30 is much"),
+    ]
+
+
+@pytest.mark.process
+def test_the_cure_of_a_shared_place_is_one_that_the_simulation_has(load, refusal):
+    own = "agent_parameters, where the simulation lets it differ, tells them apart"
+    shared = "port 0: agent-1, agent-2, agent-3 cannot have it at once on one machine"
+    text = OWN.replace("agent_parameters:\n", "")
+
+    (note,) = place_notes(load(text))
+    told = refusal(text + "time: {mode: lockstep}\n")
+
+    assert f"{shared}; {own}; so do machines of their own\n" in note
+    assert f"{shared}; {own}\n" in told
 
 
 def test_the_host_sees_the_parameters_of_all_and_those_of_each_agent(load):

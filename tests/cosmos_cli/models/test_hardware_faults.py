@@ -163,6 +163,25 @@ def inventory(folder: Path, *devices: str, connection: str = "local") -> Path:
 
 
 @pytest.mark.parametrize(
+    "devices",
+    [
+        ("sense_hat", "{name: sense_hat, kind: synthetic}"),
+        ("{name: sense_hat, kind: synthetic}", "sense_hat"),
+        ("{name: sense_hat, kind: synthetic}", "{name: sense_hat, kind: synthetic}"),
+    ],
+)
+def test_a_device_is_listed_once_whatever_comes_first(
+    folder: Path, devices: tuple[str, str]
+) -> None:
+    with pytest.raises(InputError) as caught:
+        load_machines(inventory(folder, *devices))
+
+    assert [(fault.line, fault.text) for fault in caught.value.faults] == [
+        (7, "sense_hat is listed already")
+    ]
+
+
+@pytest.mark.parametrize(
     ("line", "told"),
     [
         ("{name: imu, kind: sense_hatt}", "did you mean sense_hat?"),

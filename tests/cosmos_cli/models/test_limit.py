@@ -62,6 +62,14 @@ def test_group_without_machines_is_known_where_it_is_told():
         ("~x", "no machine or group is like ~x; there are"),
         ("~(", "~(: not a regular expression"),
         (
+            "~a{99999999999}",
+            "~a{99999999999}: not a regular expression: the repetition number is too large",
+        ),
+        (
+            "~" + "(" * 1500 + ")" * 1500,
+            "not a regular expression: its brackets are nested too deeply",
+        ),
+        (
             "pi0[1:2]",
             "--limit pi0[1:2]: pi0[1:2] counts places in a group, and none is named pi0;"
             " for machines write pi01:pi02, or a glob such as pi0?",

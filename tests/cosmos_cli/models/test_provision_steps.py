@@ -100,6 +100,8 @@ def test_source_is_found_from_the_inventorys_folder(read, tmp_path, monkeypatch)
         ('line: {path: /x, line: "a\\nb"}', ".line.line", "expected one line of text, got 'a\\nb'"),
         ('line: {path: /x, line: a, regexp: "("}', ".line.regexp",
          "not a regular expression: missing ), unterminated subpattern at position 0"),
+        ('line: {path: /x, line: a, regexp: "a{99999999999}"}', ".line.regexp",
+         "not a regular expression: the repetition number is too large"),
         ("service: {name: x}", ".service", "expected enabled, state or both: nothing is asked of the service"),
         ("service: {name: -x, enabled: true}", ".service.name", "expected the name of a systemd unit, got '-x'"),
         ("command: {run: x}", ".command",

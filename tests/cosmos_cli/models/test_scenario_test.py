@@ -109,6 +109,18 @@ def test_values_of_any_kind_come_through(scenario):
     assert (found.seed, found.description, found.agents.tick_hz) == (7, 'é "x": {}', 10.0)
 
 
+def test_a_variables_number_stands_as_the_test_writes_it(tmp_path):
+    path = tmp_path / "s.yaml"
+    path.write_text(
+        f"{HEAD}vars: {{tag: 1}}\ndescription: run ${{tag}}\ntest: {{set: {{vars.tag: 007}}}}\n"
+    )
+    outline = read_outline(path)
+
+    loaded = outline.load(outline.overrides(), print)
+
+    assert loaded.scenario.description == "run 007"
+
+
 def test_the_command_line_counts_more_than_the_test(scenario):
     outline = read_outline(scenario("{set: {agents.count: 3, time.duration_s: 5, seed: 1}}"))
 

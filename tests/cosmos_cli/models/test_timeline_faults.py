@@ -268,6 +268,16 @@ def test_a_condition_travels_with_its_agents_and_in_the_unit_of_its_field(tmp_pa
     assert (condition.bounds.low, condition.for_s) == (2000.0, 3.0)
 
 
+def test_a_condition_without_agents_is_of_agents_where_the_host_records_the_stream_too(
+    tmp_path: Path,
+) -> None:
+    when = "{stream: log, field: level, equals: error}"
+
+    (condition,) = load(tmp_path, f"{{when: {when}, action: stop}}").run_config("r").conditions
+
+    assert (condition.agents[0], condition.is_of_host) == ("agent-01", False)
+
+
 def test_no_action_has_a_parameter_that_a_timelines_entry_has_itself() -> None:
     assert set(ENTRY_KEYS) == set(RULE_KEYS)
     for kind in FRAMEWORK_ACTIONS:

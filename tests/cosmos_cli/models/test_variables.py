@@ -57,6 +57,21 @@ def test_in_a_longer_text_a_variable_stands_as_it_is_written(tmp_path):
     assert found.scenario.description == "a 0.50 of true, ${x} $ {x} ${who"
 
 
+@pytest.mark.parametrize(
+    ("variables", "overrides"),
+    [
+        ("tag: 007, r: 1e3", ()),
+        ("tag: 1, r: 2", ("vars.tag=007", "vars.r=1e3  # as in a file")),
+        ("own: 007, tag: '${own}', r: 1e3", ()),
+        ("own: 1, tag: '${own}', r: 2", ("vars.own=007", "vars.r=1e3")),
+    ],
+)
+def test_a_number_stands_as_it_is_written_wherever_that_is(tmp_path, variables, overrides):
+    text = f"{HEAD}vars: {{{variables}}}\ndescription: run ${{tag}} at ${{r}}\n"
+
+    assert load(tmp_path, text, *overrides).scenario.description == "run 007 at 1e3"
+
+
 def test_set_gives_a_variable_another_value_before_it_is_used(tmp_path):
     text = HEAD + "vars: {rate: 2, twice: 'at ${rate}'}\ndescription: ${twice}\nseed: ${rate}\n"
 

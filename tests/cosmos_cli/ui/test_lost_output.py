@@ -169,3 +169,11 @@ def test_commands_work_without_any_standard_stream(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("name: a\nsimulation: counter\nagents: {count: 3}\nsed: 1\n")
 
     assert shell(f"{COSMOS} validate {tmp_path / 'a.yaml'} <&- >&- 2>&-").returncode == 2
+
+
+@pytest.mark.process
+def test_a_command_that_asks_says_without_a_standard_input_how_to_agree() -> None:
+    ended = shell(f"{COSMOS} reboot -i pi07, <&-")
+
+    assert ended.returncode == 2
+    assert ended.stderr == "error: reboot 1 machine (pi07): nobody is there to ask; give --yes\n"
