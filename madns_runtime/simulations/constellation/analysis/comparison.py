@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -191,13 +191,21 @@ def _compare_positions(
             _add_positions(difference, piece, names, spread)
         if difference.count:
             found[agent] = difference
-    # Satellites that were in the same places count over time, too, where there are others.
-    for recorded in same if spread.rows() else ():
-        if (key := _time_key(recorded, _tick_hz(a))) is not None:
-            for columns in recorded.batches(key[:1]):
-                t_s = as_array(columns[key[0]]) * key[1]
-                spread.add(t_s, np.zeros(len(t_s)))
+    if (
+        spread.rows()
+    ):  # satellites that were in the same places count over time, too, where there are others
+        _add_same_places(same, _tick_hz(a), spread)
     return found, spread.rows()
+
+
+def _add_same_places(streams: Iterable[ComparedStream], tick_hz: float, spread: BinnedRms) -> None:
+    for recorded in streams:
+        key = _time_key(recorded, tick_hz)
+        if key is None:
+            continue
+        for columns in recorded.batches(key[:1]):
+            t_s = as_array(columns[key[0]]) * key[1]
+            spread.add(t_s, np.zeros(len(t_s)))
 
 
 def _time_key(recorded: ComparedStream, tick_hz: float) -> tuple[str, float] | None:
