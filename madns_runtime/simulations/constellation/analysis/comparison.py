@@ -193,9 +193,9 @@ def _compare_positions(
             found[agent] = difference
     # Satellites that were in the same places count over time, too, where there are others.
     for recorded in same if spread.rows() else ():
-        if (key := _time_key(recorded, _tick_hz(a))) is not None:
-            for columns in recorded.batches(key[:1]):
-                t_s = as_array(columns[key[0]]) * key[1]
+        if (of_time := _time_key(recorded, _tick_hz(a))) is not None:
+            for times in recorded.batches(of_time[:1]):
+                t_s = as_array(times[of_time[0]]) * of_time[1]
                 spread.add(t_s, np.zeros(len(t_s)))
     return found, spread.rows()
 
