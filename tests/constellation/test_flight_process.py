@@ -333,6 +333,30 @@ def test_what_others_send_is_counted_in_lockstep_too(tmp_path):
     assert not {"bytes_sent", "packets_unsent", "floods"} & set(interface)
 
 
+LONG = Delivery("agent-02", 0.0, 0.0, "x" * 2_000_000)
+
+
+def test_in_lockstep_a_report_that_its_way_has_no_room_for_fails_the_agent(tmp_path):
+    ship = Ship(tmp_path, program(tmp_path, ANSWER), crosslinks={}).run(1)
+    ship.agent.hear(LONG)
+
+    with pytest.raises(BlamedError, match="stdio has no room for 20[0-9]{5} bytes in 1 packet"):
+        ship.run(1)
+
+
+def test_in_real_time_mail_that_its_way_has_no_room_for_is_dropped_and_the_next_tick_sent(tmp_path):
+    command = program(tmp_path, ANSWER)
+    with Ship(tmp_path, command, is_lockstep=False, crosslinks={}) as ship:
+        ship.run_until_answered(1)
+        sent = ship.agent._cockpit._software._counts["ticks_sent"]
+        ship.agent.hear(LONG)
+        ship.run(2)
+
+    assert ship.summary["ticks_sent"] == sent + 1
+    assert (ship.summary["ticks_skipped"], ship.summary["mail_dropped"]) == (1, 1)
+    assert not ship.late["passed"]
+
+
 def test_in_real_time_no_tick_waits_and_answers_are_taken_when_they_come(tmp_path):
     gate, second_gate = tmp_path / "gate", tmp_path / "second"
     body = f"""

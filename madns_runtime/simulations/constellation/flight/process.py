@@ -156,7 +156,8 @@ class ExternalFlight:
             is_kept=self._link.transport.keeps_all,
         )
         # One that has ended already is told with its end in the first tick.
-        if not self._link.write(self._protocol.setup(told)) and not self._link.how_it_ended():
+        packets = self._protocol.setup(told)
+        if not self._link.transport.write(packets) and not self._link.how_it_ended():
             raise BlamedError(
                 f"{self._link.name}: its transport has no room for its setup: give fewer settings"
             )
@@ -289,16 +290,15 @@ class ExternalFlight:
             return
         mail = {name: list(waiting) for name, waiting in self._mail.items()}
         sent_s = self._present_s()
-        if not self._link.write(
-            self._protocol.tick(TickReport(t_s=t_s, readings=readings, **mail))
-        ):
-            counts["ticks_skipped"] += 1
-            return
-        for waiting in self._mail.values():
-            waiting.clear()
-        if not self._has_own_clock:
+        packets = self._protocol.tick(TickReport(t_s=t_s, readings=readings, **mail))
+        is_sent = self._link.write(packets)
+        counts["ticks_sent" if is_sent else "ticks_skipped"] += 1
+        if is_sent or not self._link.transport.may_take(packets):  # for which there is never room
+            counts["mail_dropped"] += (not is_sent) * sum(map(len, mail.values()))
+            for waiting in self._mail.values():
+                waiting.clear()
+        if is_sent and not self._has_own_clock:
             self._asked.add(sent_s, t_s)
-        counts["ticks_sent"] += 1
 
     def _take_answers(self, t_s: float) -> None:
         link = self._link

@@ -136,8 +136,21 @@ class FlightLink:
             )
 
     def write(self, packets: Sequence[bytes]) -> bool:
-        """Send packets; False, and none of them, if too much waits already."""
-        return self.transport.write(packets)
+        """
+        Send packets; False, and none of them, if too much waits already.
+
+        Raises:
+            BlamedError: So it is in lockstep, where nothing that software is told may be left out.
+        """
+        if self.transport.write(packets):
+            return True
+        if self._is_lockstep and not self.how_it_ended():
+            size_bytes = sum(map(len, packets))
+            raise BlamedError(
+                f"{self.who}: {self.transport.name} has no room for {size_bytes} bytes in {len(packets)} packets at "
+                "once: let it be told less in one step, by shorter messages, slower sensors or a faster rate_hz"
+            )
+        return False
 
     def how_it_ended(self) -> str:
         """Return how the software ended, in words; empty while it has not."""

@@ -244,6 +244,10 @@ class UdpLink(Transport):
                 self.counts["packets_unsent"] += 1
         return True
 
+    def may_take(self, packets: Sequence[bytes]) -> bool:
+        """Tell whether they are not too many."""
+        return len(packets) <= QUEUED_MAX
+
     def receive(self) -> bytes | None:
         """Return the datagrams that are there, together; those of others are counted."""
         found, self._first = self._first, []

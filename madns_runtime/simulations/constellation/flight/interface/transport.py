@@ -75,6 +75,10 @@ class Transport(ABC):
     def write(self, packets: Sequence[bytes]) -> bool:
         """Send all of them, as soon as they are taken; False, and none of them, if too much waits already."""
 
+    def may_take(self, packets: Sequence[bytes]) -> bool:
+        """Tell whether all of them have room at once, if nothing else waits."""
+        return True
+
     @abstractmethod
     def receive(self) -> bytes | None:
         """Return what has come, at most READ_BYTES of it; None for nothing yet, nothing for no more."""
@@ -148,6 +152,10 @@ class StreamTransport(Transport):
             self._waiting += packet
         self.push()
         return True
+
+    def may_take(self, packets: Sequence[bytes]) -> bool:
+        """Tell whether they are not too long in all."""
+        return sum(map(len, packets)) <= WAITING_BYTES_MAX
 
     def push(self) -> None:
         """Connect, and send what waits."""
