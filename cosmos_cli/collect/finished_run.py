@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.manifest import file_entry
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.onboard.processes import words_of
 from cosmos_cli.ui.name_ranges import compact
@@ -55,6 +58,34 @@ def refuse_foreign_tables(run: RunDirectory) -> None:
                 f"{path}: no collection made it, and its values would pass for the run's; remove it, or have it noted"
                 f" with: cosmos collect {run.shell_path}"
             )
+
+
+def listed_files(run: RunDirectory) -> dict[str, Mapping[str, Any]]:
+    """Return the entries of the manifest by the names of files below the run's directory."""
+    files = mapping_at(run.read_json(run.manifest_json), "files")
+    return {name: entry for name, entry in files.items() if isinstance(entry, Mapping)}
+
+
+def is_as_listed(entry: Mapping[str, Any], path: Path) -> bool:
+    """Tell whether a file is what its entry says: a value that was damaged is no value to judge by."""
+    try:
+        status = path.lstat()
+        is_whole = stat.S_ISREG(status.st_mode) and status.st_size == entry.get("bytes")
+        return is_whole and file_entry(path)["sha256"] == entry.get("sha256")
+    except OSError:
+        return False
+
+
+def changed_tables(run: RunDirectory) -> tuple[str, ...]:
+    """Return a remark per table that is there and is not as it was collected; those that are gone are told elsewhere."""
+    return tuple(
+        f"{name} is not as it was collected: what is told of it need not be of the run; make it anew with:"
+        f" cosmos collect {run.shell_path}"
+        for name, entry in listed_files(run).items()
+        if name.startswith(f"{run.tables.name}/")
+        and os.path.isfile(run.path / name)
+        and not is_as_listed(entry, run.path / name)
+    )
 
 
 def refuse_living(run: RunDirectory, processes: Sequence[ProcessEntry]) -> None:

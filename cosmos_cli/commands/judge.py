@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +10,8 @@ import typer
 
 from cosmos_cli.collect.finished_run import (
     collected_document,
+    is_as_listed,
+    listed_files,
     refuse_foreign_tables,
     refuse_living,
 )
@@ -22,7 +23,6 @@ from cosmos_cli.evidence.expectations.of_run import (
     judge_run,
     planned_expectations,
 )
-from cosmos_cli.evidence.manifest import file_entry
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_documents import fault_of, fault_of_plan, fault_of_summary
 from cosmos_cli.evidence.run_search import find_run
@@ -109,38 +109,21 @@ def _collected(run: RunDirectory) -> Mapping[str, Any]:
         raise InputError(
             f"{run.manifest_json}: {fault}; make it anew with: cosmos collect {run.shell_path}"
         )
-    files = _listed_files(run)
+    files = listed_files(run)
     plan = files.get(run.plan_json.name)
-    if plan is not None and not _is_as(plan, run.plan_json):
+    if plan is not None and not is_as_listed(plan, run.plan_json):
         raise InputError(
             f"{run.plan_json}: changed since the run was collected, and what was expected with it; put it back as it"
             f" was, or have the change noted with: cosmos collect {run.shell_path}"
         )
     tables = {n: entry for n, entry in files.items() if n.startswith(f"{run.tables.name}/")}
-    cut = [name for name, entry in tables.items() if not _is_as(entry, run.path / name)]
+    cut = [name for name, entry in tables.items() if not is_as_listed(entry, run.path / name)]
     if cut:
         what = f"{run.path / cut[0]}" + (f" and {len(cut) - 1} more" if cut[1:] else "")
         text = "missing, or not as it was collected"
         raise InputError(f"{what}: {text}; make it anew with: cosmos collect {run.shell_path}")
     refuse_foreign_tables(run)
     return document
-
-
-def _listed_files(run: RunDirectory) -> dict[str, Mapping[str, Any]]:
-    """Return the entries of the manifest by the names of files below the run's directory."""
-    files = (run.read_json(run.manifest_json) or {}).get("files")
-    listed = files.items() if isinstance(files, dict) else ()
-    return {name: entry for name, entry in listed if isinstance(entry, dict)}
-
-
-def _is_as(entry: Mapping[str, Any], path: Path) -> bool:
-    """Tell whether a file is what its entry says: a value that was damaged is no value to judge by."""
-    try:
-        status = path.lstat()
-        is_whole = stat.S_ISREG(status.st_mode) and status.st_size == entry.get("bytes")
-        return is_whole and file_entry(path)["sha256"] == entry.get("sha256")
-    except OSError:
-        return False
 
 
 def _not_finite(document: Mapping[str, Any]) -> int:

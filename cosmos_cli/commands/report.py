@@ -7,7 +7,11 @@ from typing import Annotated
 
 import typer
 
-from cosmos_cli.collect.finished_run import collected_document, refuse_foreign_tables
+from cosmos_cli.collect.finished_run import (
+    changed_tables,
+    collected_document,
+    refuse_foreign_tables,
+)
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import runs_root
@@ -40,6 +44,8 @@ def report(
         raise InputError(
             f"{found.run_json}: {fault}; make it anew with: cosmos collect {found.shell_path}"
         )
+    if changed := changed_tables(found):
+        document["remarks"] = [*document.get("remarks", ()), *changed]
     if as_json:
         console.print_json(with_simulation(found, document, console.warn))
     if html is not None:

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.unread_files import find_unread
 from cosmos_cli.errors import InputError
@@ -91,8 +93,9 @@ class Recorded:
             yield from self.reader.batches(self.source, wanted, ROWS_READ_MAX, is_exact=True)
             return
         for file in self.files:
-            for columns, _ in read_batches(file, StreamReading(file.path)):
-                yield {name: columns[name] for name in wanted}
+            for columns, count in read_batches(file, StreamReading(file.path)):
+                nothing = np.empty(count, dtype=object)  # of what another incarnation alone has
+                yield {name: columns.get(name, nothing) for name in wanted}
 
     def lines(self) -> Lines | None:
         """

@@ -244,7 +244,8 @@ class TableReader:
         self._groups: dict[str, list[int]] = {}
         for index in range(self._file.num_row_groups):
             column = self._file.read_row_group(index, columns=[self._source_column]).column(0)
-            self._groups.setdefault(str(column[0].as_py()), []).append(index)
+            if len(column):
+                self._groups.setdefault(str(column[0].as_py()), []).append(index)
 
     @property
     def rows(self) -> int:

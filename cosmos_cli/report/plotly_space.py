@@ -59,11 +59,17 @@ def _colour(path: SpacePath, place: int) -> str:
 
 def _proportions(figure: SpaceFigure) -> dict[str, float]:
     """Return the sides of the box of all that is drawn, the longest 1: so it fits whatever its shape."""
-    radius = figure.sphere_radius or 0.0
-    paths = [path.points for path in figure.paths]
-    every = np.concatenate([[[-radius] * 3, [radius] * 3], *paths])
-    sides = np.nanmax(every, axis=0) - np.nanmin(every, axis=0)
-    return dict(zip("xyz", (sides / max(sides.max(), 1e-300)).tolist(), strict=True))
+    drawn = [path.points for path in (*figure.paths, figure.spots) if path is not None]
+    if figure.sphere_radius is not None:
+        drawn.append(figure.sphere_radius * np.array([[-1.0] * 3, [1.0] * 3]))
+    every = np.concatenate([np.empty((0, 3)), *drawn])
+    every = every[np.isfinite(every).all(axis=1)]
+    sides = np.ptp(every, axis=0) if len(every) else np.zeros(3)
+    if (
+        not 0.0 < sides.max() < np.inf
+    ):  # a single point, or none, or farther apart than a float tells
+        sides = np.ones(3)
+    return dict(zip("xyz", (sides / sides.max()).tolist(), strict=True))
 
 
 def _scatter3d(points: Floats, colour: str, width: float, name: str) -> Trace:

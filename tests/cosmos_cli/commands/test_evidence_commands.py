@@ -2,6 +2,7 @@ import json
 import os
 import shutil
 
+import pyarrow.parquet as pq
 import pytest
 from harness.synthetic_run import SyntheticRun
 
@@ -412,3 +413,23 @@ def test_current_folder_that_was_deleted_is_told_as_such(tmp_path, monkeypatch, 
 
     assert app.run(arguments) == 2
     assert "the current folder is gone" in capsys.readouterr().err
+
+
+def test_report_tells_of_a_table_that_is_not_as_it_was_collected(made, capsys):
+    """As one that somebody wrote again with another program, which may put records of two agents into one group."""
+    finish(made)
+    path = made.run.tables / "round_trips.parquet"
+    rows = pq.read_table(path)
+    pq.write_table(rows, path)
+    page = made.run.path.parent / "page.html"
+
+    assert app.run(["report", "1"]) == 0
+    assert app.run(["report", "1", "--html", str(page)]) == 0
+
+    remark = "tables/round_trips.parquet is not as it was collected: what is told of it need not be of the run"
+    assert remark in capsys.readouterr().out
+    assert remark in page.read_text()
+    assert app.run(["collect", "1"]) == 0  # makes it anew
+    capsys.readouterr()
+    assert app.run(["report", "1"]) == 0
+    assert "not as it was collected" not in capsys.readouterr().out

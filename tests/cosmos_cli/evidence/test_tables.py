@@ -635,3 +635,17 @@ def test_schema_line_that_was_damaged_makes_its_stream_one_that_cannot_be_read(
 
     assert summary.exit_code == 5
     assert summary.missing == (f"agent-01: {stream} the schema line is missing or damaged",)
+
+
+def test_group_without_a_record_is_of_nobody(tmp_path):
+    """As one is that another program wrote, which took all records of a table out."""
+    made = SyntheticRun(tmp_path).write()
+    gather(made.run, 10.0, lambda *told: None)
+    path = made.run.tables / "round_trips.parquet"
+    nothing = pq.read_table(path).slice(0, 0)
+    with pq.ParquetWriter(path, nothing.schema) as writer:
+        writer.write_table(nothing)
+
+    table = open_tables(made.run.tables)["round_trips"]
+
+    assert (table.rows, table.sources) == (0, ())

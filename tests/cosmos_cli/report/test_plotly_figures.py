@@ -399,3 +399,31 @@ def test_tables_and_remarks_of_other_values_are_refused_where_they_are_made():
         TableBlock(title="t", headings=["a"], rows=[[1]])
     with pytest.raises(ValueError, match="ReportRemark.text: expected a text, got int"):
         ReportRemark(text=5)
+
+
+CUBE = [[100.0, 0.0, 0.0], [101.0, 1.0, 1.0]]
+CUBOID = [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], [[4.0, 0.5, 2.0]]
+
+
+@pytest.mark.parametrize(
+    ("drawn", "sides"),
+    [
+        ({"paths": [SpacePath(points=CUBE)]}, (1.0, 1.0, 1.0)),  # far from the origin
+        ({"paths": [], "spots": SpacePath(points=CUBE)}, (1.0, 1.0, 1.0)),
+        (
+            {"paths": [SpacePath(points=CUBOID[0])], "spots": SpacePath(points=CUBOID[1])},
+            (1.0, 0.25, 0.5),
+        ),
+        ({"paths": [SpacePath(points=CUBE)], "sphere_radius": 101.0}, (1.0, 1.0, 1.0)),
+        ({"paths": [SpacePath(points=[[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]])]}, (1.0, 0.5, 0.0)),
+        ({"paths": [SpacePath(points=[*CUBE, [np.nan, np.inf, 0.0]])]}, (1.0, 1.0, 1.0)),
+        ({"paths": [SpacePath(points=[[np.nan] * 3])]}, (1.0, 1.0, 1.0)),
+        ({"paths": [SpacePath(points=[[-1.7e308] * 3, [1.7e308] * 3])]}, (1.0, 1.0, 1.0)),
+        ({"paths": []}, (1.0, 1.0, 1.0)),
+    ],
+)
+def test_a_scene_has_the_proportions_of_all_that_is_drawn_in_it(drawn, sides):
+    with np.errstate(over="ignore"):  # as where a page is written
+        scene = to_plotly(SpaceFigure(title="t", unit="m", **drawn)).layout["scene"]
+
+    assert scene["aspectratio"] == pytest.approx(dict(zip("xyz", sides, strict=True)))
