@@ -53,8 +53,8 @@ from madns_runtime.hardware.action_socket import SOCKET_NAME as ACTIONS_SOCKET
 from madns_runtime.hardware.order_socket import SOCKET_NAME as ORDERS_SOCKET
 from madns_runtime.processes import ProcessEntry, list_processes
 
-"""Of a process that holds several agents: their names with commas."""
 LivingProcesses = Callable[[], Sequence[ProcessEntry]]
+"""Lists the processes that live on this computer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
