@@ -86,6 +86,10 @@ def test_duration_and_a_set_duration_are_refused(scenario, capsys):
             ["plan", "s.yaml", "--set", "time.mode=lockstep", "--latency-ms", "3"],
             "in lockstep none of it applies",
         ),
+        (
+            ["plan", "s.yaml", "--set", "time.mode=lockstep", "--bandwidth-mbit", "3"],
+            "in lockstep none of it applies",
+        ),
         (["ps", "--limit", "x"], "no machines without an inventory"),
         (["run", "s.yaml", "--host", "x"], "no machine without an inventory"),
     ],
