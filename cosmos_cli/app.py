@@ -13,6 +13,7 @@ import tempfile
 import traceback
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -190,6 +191,9 @@ def _report_unexpected(error: Exception, wants_json: bool) -> int:
     if isinstance(error, FileNotFoundError) and _is_here_gone():
         text = "the current folder is gone: it was deleted; change to another one with cd"
         return _report(_plain(InputError.kind, text, ExitCode.BAD_INPUT), text, wants_json)
+    if isinstance(error, RuntimeError) and _has_no_home():
+        text = "no home folder is known of this user: set HOME to a folder of yours"
+        return _report(_plain(InputError.kind, text, ExitCode.BAD_INPUT), text, wants_json)
     head = f"unexpected {type(error).__name__}: {error}"
     if os.environ.get("COSMOS_DEBUG"):
         print_error(traceback.format_exc().rstrip(), bare=True)
@@ -205,6 +209,15 @@ def _is_here_gone() -> bool:
     try:
         os.getcwd()
     except FileNotFoundError:
+        return True
+    return False
+
+
+def _has_no_home() -> bool:
+    """Tell whether neither HOME nor the system names the user's folder, as in a container that is given any user."""
+    try:
+        Path.home()
+    except RuntimeError:
         return True
     return False
 

@@ -64,12 +64,15 @@ class _Wish:
         """
         if self.action and self.action not in ACTIONS:
             raise InputError(f"{self.action}: expected test, record, verify, calibrate, or nothing")
-        if self.action == "verify":
-            if len(self.names) != 1 or self.has_inventory:
-                raise self._error("expected one KIND or ./file.py:NAME, and no inventory")
-            return
         if self.of_calibration and self.action != "calibrate":
             raise self._error("--from, --channel, --field-ut and --place are of calibrate alone")
+        if self.action == "verify":
+            if len(self.names) != 1 or self.has_inventory:
+                raise self._error(
+                    "expected one KIND or ./file.py:NAME, and no inventory: leave out -i and"
+                    " COSMOS_INVENTORY"
+                )
+            return
         if self.parameters:
             raise self._error("--parameters is of verify alone")
         if self.action == "calibrate":
@@ -153,6 +156,8 @@ def devices(
         write=write,
         of_calibration=bool(from_ or channel or place) or field_ut is not None,
     ).refuse_misfits()
+    if not inventory:
+        refuse_stray_limit(limit)
     if action == "verify":
         return verify_driver(console, names[0], parameters or (), write=write)
     if action == "calibrate":
@@ -164,7 +169,6 @@ def devices(
         fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
         return calibrate_device(console, fleet, wish, seconds)
     if not inventory:
-        refuse_stray_limit(limit)
         return _list_kinds(console)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
     if not action:

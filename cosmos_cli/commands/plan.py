@@ -89,10 +89,11 @@ def plan(
         labels=scenario_file.labels,
     )
     check_places(scenario_file, launch_plan)
-    if launch_plan.is_lockstep and {latency_ms, workers, maneuvers_at_once} != {None}:
+    given_here = {bandwidth_mbit, latency_ms, workers, maneuvers_at_once}
+    if launch_plan.is_lockstep and given_here != {None}:
         raise InputError(
-            "--latency-ms, --workers and --maneuvers-at-once say what real time has to bear; in lockstep"
-            " none of it applies"
+            "--bandwidth-mbit, --latency-ms, --workers and --maneuvers-at-once say what real time has to"
+            " bear; in lockstep none of it applies"
         )
     given = scenario_file.scenario.plan
     latency_s, latency_source = latency_of(

@@ -98,18 +98,16 @@ def ps(
         tell=failure_teller(console),
     )
     outcomes = fleet.look(_others(distinct(planned, listed)))
-    parts = [
-        part
-        for part in (*_here(here), *_there(outcomes))
-        if run is None or is_called(part.run, part.directory, run)
-    ]
+    living = [*_here(here), *_there(outcomes)]
+    parts = [part for part in living if run is None or is_called(part.run, part.directory, run)]
     parts.sort(key=lambda part: (part.run, part.machine or ""))
     rows = [row for part in parts for row in _rows(part, is_every_agent=all_)]
     if rows:
         console.table(COLUMNS, rows)
     bad = failed(outcomes)
     if not rows:
-        console.say(_nothing_words(len(outcomes) - len(bad), bool(outcomes)))
+        where = _where(len(outcomes) - len(bad))
+        console.say(f"no run lives {where}" if run is None else _unknown_words(run, where, living))
     if bad:
         unasked = compact(outcome.machine for outcome in bad)
         console.say(f"whether a run lives there is not known: {unasked} could not be asked")
@@ -126,11 +124,15 @@ def ps(
     return int(exit_code)
 
 
-def _nothing_words(answered: int, has_asked: bool) -> str:
-    """Say where no run lives: what nobody could ask about is left out."""
-    if not has_asked or not answered:
-        return "no run lives on this machine"
-    return f"no run lives on this machine and on the {counted(answered, 'machine')} that answered"
+def _where(answered: int) -> str:
+    """Say of which machines it is known what lives there: what nobody could ask about is left out."""
+    here = "on this machine"
+    return f"{here} and on the {counted(answered, 'machine')} that answered" if answered else here
+
+
+def _unknown_words(which: str, where: str, living: Sequence[RunPart]) -> str:
+    names = ", ".join(sorted({part.run for part in living})) or "none"
+    return f"{which}: no such run lives {where}; living runs: {names}"
 
 
 def _others(targets: Sequence[Target]) -> list[Target]:

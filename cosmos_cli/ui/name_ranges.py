@@ -23,7 +23,7 @@ def compact(names: Iterable[str]) -> str:
     """
     Return names with ranges for runs of numbers: pi[01:24], laptop.
 
-    What comes out, with colons for the commas, is a pattern for `--limit`.
+    An inventory reads it so; to `--limit` brackets count places in a group.
     """
     pieces: list[str] = []
     run: list[str] = []

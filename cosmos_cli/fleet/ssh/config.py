@@ -192,8 +192,8 @@ def _match_exec(command: str, query: _Query) -> bool:
 _CRITERIA: dict[str, Callable[[str, _Query], bool]] = {
     "host": lambda text, query: matches(text.split(","), query.first("hostname") or query.host),
     "originalhost": lambda text, query: matches(text.split(","), query.host),
-    "user": lambda text, query: matches(text.split(","), query.first("user") or getpass.getuser()),
-    "localuser": lambda text, query: matches(text.split(","), getpass.getuser()),
+    "user": lambda text, query: matches(text.split(","), query.first("user") or local_user()),
+    "localuser": lambda text, query: matches(text.split(","), local_user()),
     "exec": _match_exec,
 }
 
@@ -218,15 +218,23 @@ def glob_of(pattern: str) -> re.Pattern[str]:
     return re.compile(re.escape(pattern).replace(r"\*", ".*").replace(r"\?", "."))
 
 
+def local_user() -> str:
+    """Return who runs this process: by number where no name goes with it, as in a container that is given any user."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # KeyError before Python 3.13
+        return str(os.getuid())
+
+
 def _tokens(query: _Query) -> dict[str, str]:
     local = socket.gethostname()
     return {
         "h": query.first("hostname") or query.host,
         "n": query.host,
         "p": query.first("port") or "22",
-        "r": query.first("user") or getpass.getuser(),
+        "r": query.first("user") or local_user(),
         "k": query.first("hostkeyalias") or query.host,
-        "u": getpass.getuser(),
+        "u": local_user(),
         "i": str(os.getuid()),
         "d": os.path.expanduser("~"),
         "l": local,

@@ -7,7 +7,6 @@ COSMOS_SSH_CONFIG names a file that is read instead of ~/.ssh/config and /etc/ss
 from __future__ import annotations
 
 import functools
-import getpass
 import os
 import re
 import shlex
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.fleet.ssh.config import Values, read_config
+from cosmos_cli.fleet.ssh.config import Values, local_user, read_config
 from cosmos_cli.fleet.ssh.known_hosts import SSH_PORT, names_of
 from cosmos_cli.fleet.target import Target
 
@@ -95,7 +94,7 @@ def settings_of(target: Target) -> SshSettings:
     return SshSettings(
         host=host,
         port=port,
-        user=target.user or value("user") or getpass.getuser(),
+        user=target.user or value("user") or local_user(),
         names=names_of(host, port, value("hostkeyalias")),
         key_files=tuple(map(_path, named or DEFAULT_KEYS)),
         are_keys_named=bool(named),

@@ -86,6 +86,17 @@ def test_duration_and_a_set_duration_are_refused(scenario, capsys):
             ["plan", "s.yaml", "--set", "time.mode=lockstep", "--latency-ms", "3"],
             "in lockstep none of it applies",
         ),
+        (
+            ["plan", "s.yaml", "--set", "time.mode=lockstep", "--bandwidth-mbit", "3"],
+            "in lockstep none of it applies",
+        ),
+        (["devices", "verify", "synthetic", "--place", "1,2"], "--place are of calibrate alone"),
+        (["devices", "verify", "synthetic", "--limit", "x"], "no machines without an inventory"),
+        (["devices", "calibrate", "imu", "--limit", "x"], "no machines without an inventory"),
+        (
+            ["devices", "verify", "synthetic", "-i", "x,"],
+            "and no inventory: leave out -i and COSMOS_INVENTORY",
+        ),
         (["ps", "--limit", "x"], "no machines without an inventory"),
         (["run", "s.yaml", "--host", "x"], "no machine without an inventory"),
     ],

@@ -98,6 +98,18 @@ def test_ps_says_when_nothing_lives(start: Start, capsys: pytest.CaptureFixture[
     assert captured.err == "no run lives on this machine\n"
 
 
+def test_ps_of_a_run_that_does_not_live_names_those_that_do(
+    start: Start, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start("0001-a", "operator", "operator")
+
+    code = cosmos(["ps", "99"])
+
+    captured = capsys.readouterr()
+    assert (code, captured.out) == (0, "")
+    assert captured.err == "99: no such run lives on this machine; living runs: 0001-a\n"
+
+
 def test_ps_groups_by_run_and_counts_agents(
     start: Start, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+import pwd
 import resource
 import subprocess
 import sys
@@ -13,7 +14,8 @@ import pytest
 from pydantic import TypeAdapter
 
 from cosmos_cli import app
-from cosmos_cli.commands import command_group
+from cosmos_cli.cache import cache_folder
+from cosmos_cli.commands import command_group, runs
 from cosmos_cli.commands.init import render, write_new
 from cosmos_cli.errors import ExitCode, InputError, RunFailedError
 from cosmos_cli.launch.feasibility import Resources, judge
@@ -479,6 +481,21 @@ def test_an_error_before_a_command_is_known_is_json_if_asked_for(cosmos, argumen
     _, out, _ = cosmos(*arguments)
 
     assert json.loads(out)["error"]["kind"] == "usage"
+
+
+def test_a_user_without_a_home_is_told_to_name_one(cosmos, monkeypatch):
+    def fail(uid):
+        raise KeyError(f"getpwuid(): uid not found: {uid}")
+
+    for name in ("HOME", "COSMOS_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", fail)
+    monkeypatch.setattr(runs, "list_runs", lambda root: cache_folder())  # as a run's start asks
+
+    code, _, err = cosmos("runs")
+
+    assert code == ExitCode.BAD_INPUT
+    assert err == "error: no home folder is known of this user: set HOME to a folder of yours\n"
 
 
 def test_init_says_that_a_folder_cannot_be_called_so(cosmos):

@@ -1,6 +1,7 @@
 """How to log in at a machine: the inventory first, then the ssh configuration, then ssh's defaults."""
 
 import getpass
+import os
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,18 @@ def configure(home):
 
 def settings(**values):
     return settings_of(Target(**({"name": "pi", "address": "10.0.0.7"} | values)))
+
+
+@pytest.mark.parametrize("error", [KeyError, OSError])  # before and from Python 3.13
+def test_a_user_without_a_name_logs_in_by_that_of_the_inventory(configure, monkeypatch, error):
+    def fail():
+        raise error("getpwuid(): uid not found: 12345")
+
+    monkeypatch.setattr(getpass, "getuser", fail)
+    configure(f"Match localuser {os.getuid()}", "  Port 3")
+
+    assert (settings(user="lab").user, settings().user) == ("lab", str(os.getuid()))
+    assert settings().port == 3
 
 
 def test_defaults_are_those_of_ssh(home, monkeypatch):
