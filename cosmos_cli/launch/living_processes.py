@@ -163,8 +163,13 @@ def is_called(run: str, directory: str, which: str) -> bool:
     if os.sep in which:
         return Path(which).resolve() == Path(directory).resolve()
     number = run.split("-", 1)[0]
-    is_number = which.isdecimal() and number.isdecimal() and int(which) == int(number)
+    # Compared as digits: Python makes no number of more than some thousands of them.
+    is_number = which.isdecimal() and number.isdecimal() and _digits(which) == _digits(number)
     return which == run or is_number
+
+
+def _digits(number: str) -> str:
+    return number.lstrip("0") or "0"
 
 
 def living_runs() -> list[LivingRun]:
