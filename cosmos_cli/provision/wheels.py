@@ -35,6 +35,7 @@ from cosmos_cli.provision.lock import Chosen, Locked, normal_name
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.trees import Progress, folder_tree
 from cosmos_cli.system.bounded_process import run_bounded
+from cosmos_cli.system.ownership import read_own_file
 from cosmos_cli.ui.step_times import HERE, timed
 from madns_runtime.bounded_files import read_regular_file, real_path
 from madns_runtime.partial_file import write_whole
@@ -254,12 +255,12 @@ def _kept_of_folder(folder: Path, text: str, say: Callable[[str], None]) -> Path
     tree = folder_tree(f"requirement {text}", folder)
     note = cache_folder() / "built" / tree.hash
     try:
-        kept = Path(read_regular_file(note, bytes_max=NOTE_BYTES_MAX).decode())
+        kept = Path(read_own_file(note, bytes_max=NOTE_BYTES_MAX).decode())
         _spare(kept.parent)
         if kept.is_file():
             return kept
-    except OSError:
-        pass  # never built, or forgotten
+    except (OSError, ValueError):
+        pass  # never built, forgotten, or damaged; or another user laid it there
     with tempfile.TemporaryDirectory(prefix="cosmos-build-") as private:
         # What a build leaves beside its sources must not make another tree of them.
         source, made = Path(private, "source"), Path(private, "made")
