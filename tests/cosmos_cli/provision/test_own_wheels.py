@@ -15,7 +15,12 @@ from made_wheels import make_wheel
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.provision import wheels
-from cosmos_cli.provision.wheels import own_wheel, with_own_wheels
+from cosmos_cli.provision.wheels import (
+    UNUSED_S_MAX,
+    own_wheel,
+    remove_unused,
+    with_own_wheels,
+)
 from cosmos_cli.system import ownership
 
 SCENARIO = "name: a\nsimulation: counter\nagents: {count: 1}\nrequirements: ["
@@ -94,6 +99,19 @@ def test_note_of_another_user_of_what_was_built_is_not_believed(folder, cache, m
     with_own_wheels(["./cars"], folder)
 
     assert builds == ["./cars", "./cars"]
+
+
+def test_note_of_what_was_built_goes_when_nobody_wanted_it_for_long(folder, cache):
+    with_own_wheels(["./cars"], folder)
+    (note,) = (cache / "built").iterdir()
+    os.utime(note, (1000.0, 1000.0))
+
+    with_own_wheels(["./cars"], folder)
+    remove_unused(cache, now_s=note.stat().st_mtime + UNUSED_S_MAX)
+    assert note.exists(), "it was just used"
+
+    remove_unused(cache, now_s=note.stat().st_mtime + UNUSED_S_MAX + 1.0)
+    assert not note.exists()
 
 
 def test_damaged_note_of_what_was_built_is_written_anew(folder, cache):
