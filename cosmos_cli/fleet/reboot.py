@@ -118,7 +118,10 @@ class Rebooting:
             done = connection.run(
                 f"cat {BOOT_ID_FILE}", timeout_s=timeout_s, said_bytes_max=SMALL_BYTES_MAX
             )
-            return done.stdout.decode(errors="replace").strip()
+            is_told = (
+                done.exit_status == 0
+            )  # else what came is the words of a shell that lets nobody in
+            return done.stdout.decode(errors="replace").strip() if is_told else ""
 
 
 def refuse_if_living(living: Sequence[Mapping[str, Any]]) -> None:

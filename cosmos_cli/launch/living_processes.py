@@ -6,7 +6,6 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 from cosmos_cli.collect.machine_sources import RecordingMachine
@@ -23,6 +22,7 @@ from cosmos_cli.launch.machines import PARTS
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.onboard.processes import RunEnding, run_directory
 from cosmos_cli.system.import_turn import IMPORT_TURN
+from madns_runtime.bounded_files import real_path
 from madns_runtime.processes import ProcessEntry, list_processes
 
 ROLE_ORDER = ("operator", "host", "supervisor", "agent")
@@ -161,10 +161,15 @@ class LivingRun:
 def is_called(run: str, directory: str, which: str) -> bool:
     """Tell whether *which* is the name, number or directory of a run."""
     if os.sep in which:
-        return Path(which).resolve() == Path(directory).resolve()
+        return real_path(which) == real_path(directory)
     number = run.split("-", 1)[0]
-    is_number = which.isdecimal() and number.isdecimal() and int(which) == int(number)
+    # Compared as digits: Python makes no number of more than some thousands of them.
+    is_number = which.isdecimal() and number.isdecimal() and _digits(which) == _digits(number)
     return which == run or is_number
+
+
+def _digits(number: str) -> str:
+    return number.lstrip("0") or "0"
 
 
 def living_runs() -> list[LivingRun]:

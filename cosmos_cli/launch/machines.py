@@ -154,7 +154,8 @@ class RemoteMachine:
             MachineFailure: It does not answer.
         """
         asked = self.connection.run(f"cat {BOOT_ID_FILE}", timeout_s=ASK_TIMEOUT_S)
-        return asked.stdout.decode(errors="replace").strip() != self.identity[0]
+        is_told = asked.exit_status == 0  # a machine without memory starts no program either
+        return is_told and asked.stdout.decode(errors="replace").strip() != self.identity[0]
 
     def connect_again(self) -> None:
         """

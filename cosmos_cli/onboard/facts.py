@@ -197,11 +197,15 @@ def _clock(proc: str) -> dict[str, PlainValue]:
 
 
 def _disk(root: str) -> dict[str, PlainValue]:
-    """Tell of the file system on which *root* is, or will be."""
+    """Tell of the file system on which *root* is, or will be; a link to a disk that is not mounted is refused."""
     path = os.path.abspath(os.path.expanduser(root))
     while not os.path.lexists(path) and path != "/":
         path = os.path.dirname(path)
-    found = os.statvfs(path)
+    try:
+        found = os.statvfs(path)
+    except FileNotFoundError:
+        text = f"{path}: a link that leads nowhere ({os.path.realpath(path)})"
+        raise HelperRefusal("step", text, "mount what it leads to, or remove the link") from None
     return {
         "path": path,
         "total_bytes": found.f_blocks * found.f_frsize,

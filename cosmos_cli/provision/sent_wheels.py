@@ -39,7 +39,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision.lock import Locked
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.system import file_lock
-from madns_runtime.bounded_files import read_regular_file
+from cosmos_cli.system.ownership import read_own_file
 
 RULE = 1
 """Of what is left out and added; another one makes other wheels."""
@@ -115,9 +115,9 @@ def _writes_for(platform: Platform) -> bool:
 
 
 def _noted(folder: Path, locked: Locked) -> Locked | None:
-    """Return what was made earlier, if it is still there."""
+    """Return what was made earlier, if it is still there; what another user laid there is not believed."""
     try:
-        note = json.loads(read_regular_file(folder / NOTE, bytes_max=NOTE_BYTES_MAX))
+        note = json.loads(read_own_file(folder / NOTE, bytes_max=NOTE_BYTES_MAX))
         sent = replace(locked, sha256=str(note["sha256"]), size_bytes=int(note["size_bytes"]))
         size_bytes = (folder / locked.filename).stat().st_size
     except (OSError, ValueError, KeyError, TypeError):

@@ -27,7 +27,7 @@ def setting_steps(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
     Yield a step for each setting that is to be made, changed, or put back.
 
     Raises:
-        MachineFailure: One cannot be made, or what was before is not readable any more.
+        MachineFailure: One cannot be made or put back, or what was before is not readable any more.
     """
     plan = _Plan(facts=facts, desired=desired, memory=read_memory(facts.file(desired.memory_path)))
     for setting in SETTINGS:
@@ -113,6 +113,9 @@ class _Plan:
             return
         before = (known or {}).get("file")
         values = self._former_values(setting, (known or {}).get("values") or {})
+        for _, value in values:
+            if (refusal := setting.put_back_refusal(value, self.facts)) is not None:
+                raise MachineFailure(FailureKind.UNSUPPORTED, *refusal)
         requests = []
         if values:
             requests.append(_set(values))

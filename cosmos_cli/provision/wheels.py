@@ -35,6 +35,7 @@ from cosmos_cli.provision.lock import Chosen, Locked, normal_name
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.trees import Progress, folder_tree
 from cosmos_cli.system.bounded_process import run_bounded
+from cosmos_cli.system.ownership import read_own_file
 from cosmos_cli.ui.step_times import HERE, timed
 from madns_runtime.bounded_files import read_regular_file, real_path
 from madns_runtime.partial_file import write_whole
@@ -181,7 +182,7 @@ def remove_unused(cache: Path, *, now_s: float) -> None:
     Remove what was not used for UNUSED_S_MAX, the wheels that nothing else needs, and what was left half made.
 
     Args:
-        cache: With the folders "locks" and "wheels".
+        cache: With the folders "locks", "wheels" and "built".
         now_s: By the wall clock.
     """
     needed: set[str] = set()
@@ -192,16 +193,20 @@ def remove_unused(cache: Path, *, now_s: float) -> None:
                 path.with_suffix(".lock").unlink(missing_ok=True)
             else:
                 needed |= {wheel["sha256"] for wheel in json.loads(path.read_bytes())["wheels"]}
+    for note in (cache / "built").glob("*"):
+        with contextlib.suppress(OSError):
+            if now_s - note.stat().st_mtime > UNUSED_S_MAX:
+                note.unlink()
     for path in (cache / "wheels").glob("*"):
         with contextlib.suppress(OSError):
             if path.name not in needed and now_s - path.stat().st_mtime > MAKING_S_MAX:
                 shutil.rmtree(path)
 
 
-def _spare(folder: Path) -> None:
-    """Make a wheel's folder one that somebody is just using, for `remove_unused` of other commands."""
+def _spare(path: Path) -> None:
+    """Make a wheel's folder, or a note, one that somebody is just using, for `remove_unused` of other commands."""
     with contextlib.suppress(OSError):  # not there yet, or another user's
-        os.utime(folder)
+        os.utime(path)
 
 
 def _is_there(path: Path, locked: Locked) -> bool:
@@ -254,12 +259,13 @@ def _kept_of_folder(folder: Path, text: str, say: Callable[[str], None]) -> Path
     tree = folder_tree(f"requirement {text}", folder)
     note = cache_folder() / "built" / tree.hash
     try:
-        kept = Path(read_regular_file(note, bytes_max=NOTE_BYTES_MAX).decode())
+        kept = Path(read_own_file(note, bytes_max=NOTE_BYTES_MAX).decode())
         _spare(kept.parent)
         if kept.is_file():
+            _spare(note)
             return kept
-    except OSError:
-        pass  # never built, or forgotten
+    except (OSError, ValueError):
+        pass  # never built, forgotten, or damaged; or another user laid it there
     with tempfile.TemporaryDirectory(prefix="cosmos-build-") as private:
         # What a build leaves beside its sources must not make another tree of them.
         source, made = Path(private, "source"), Path(private, "made")

@@ -21,6 +21,8 @@ if TYPE_CHECKING:  # only a plan knows facts
     from cosmos_cli.models.machine_facts import MachineFacts, SystemPaths
 
 PREFIX = "cosmos_"
+BLOCKED = "1"
+"""Of rfkill: the radio is off."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +43,10 @@ class Setting:
     """A value of the kernel in words."""
     refusal: Callable[[Any, MachineFacts], tuple[str, str] | None] = lambda value, facts: None
     """Why the setting must not, or cannot, be made there, and what to do."""
+    put_back_refusal: Callable[[str, MachineFacts], tuple[str, str] | None] = lambda value, facts: (
+        None
+    )
+    """Why a value of the kernel from before must not be put back there, and what to do."""
     variable: str = ""
     """Its name in the inventory; that of the field it is declared at."""
 
@@ -94,11 +100,14 @@ def _radio(
     kind: str,
     file: str,
     refusal: Callable[[Any, MachineFacts], tuple[str, str] | None] = lambda value, facts: None,
+    put_back_refusal: Callable[[str, MachineFacts], tuple[str, str] | None] = (
+        lambda value, facts: None
+    ),
 ) -> Setting:
     """Return the setting of radios of a kind of rfkill's: a rule for udev holds whenever one appears, whatever its number."""
 
     def soft_block(is_on: bool) -> str:
-        return "0" if is_on else "1"
+        return "0" if is_on else BLOCKED
 
     def live(facts: MachineFacts, paths: SystemPaths) -> dict[str, str]:
         return {
@@ -115,20 +124,38 @@ def _radio(
         ),
         live=live,
         wish=soft_block,
-        show=lambda value: "off" if value == "1" else "on",
+        show=lambda value: "off" if value == BLOCKED else "on",
         refusal=refusal,
+        put_back_refusal=put_back_refusal,
     )
 
 
 def _wifi_refusal(is_on: bool, facts: MachineFacts) -> tuple[str, str] | None:
-    network = facts.network
-    if is_on or not (network.is_wireless or (network.interface is None and network.wireless_up)):
+    if is_on or not _comes_over_wifi(facts):
         return None
-    name = network.interface or ", ".join(network.wireless_up)
     return (
-        f"cosmos_wifi: false would cut this very connection: it comes over Wi-Fi ({name})",
+        f"cosmos_wifi: false {_cut_words(facts)}",
         "connect the machine by cable, or give it cosmos_wifi: null in the inventory",
     )
+
+
+def _wifi_put_back_refusal(value: str, facts: MachineFacts) -> tuple[str, str] | None:
+    if value != BLOCKED or not _comes_over_wifi(facts):
+        return None
+    return (
+        f"to put cosmos_wifi back, which was off before, {_cut_words(facts)}",
+        "connect the machine by cable, or give it cosmos_wifi: true in the inventory",
+    )
+
+
+def _comes_over_wifi(facts: MachineFacts) -> bool:
+    network = facts.network
+    return bool(network.is_wireless or (network.interface is None and network.wireless_up))
+
+
+def _cut_words(facts: MachineFacts) -> str:
+    name = facts.network.interface or ", ".join(facts.network.wireless_up)
+    return f"would cut this very connection: it comes over Wi-Fi ({name})"
 
 
 class SettingVariables(BaseModel):
@@ -161,7 +188,12 @@ class SettingVariables(BaseModel):
     )
     """Governor of the processors' clock, such as performance; as it is if not given."""
     cosmos_wifi: bool | None = _declared(
-        _radio("wlan", "90-cosmos-wifi.rules", refusal=_wifi_refusal)
+        _radio(
+            "wlan",
+            "90-cosmos-wifi.rules",
+            refusal=_wifi_refusal,
+            put_back_refusal=_wifi_put_back_refusal,
+        )
     )
     """false switches the radio off, true on; as it is if not given."""
     cosmos_bluetooth: bool | None = _declared(_radio("bluetooth", "90-cosmos-bluetooth.rules"))

@@ -429,6 +429,20 @@ def test_run_is_known_by_name_number_and_directory(tmp_path: Path) -> None:
     ] == [False] * 3
 
 
+@pytest.mark.parametrize(
+    ("which", "is_it"),
+    [("7", True), ("00007", True), ("70", False), ("0", False), ("7" * 5000, False)],
+)
+def test_run_is_known_by_a_number_of_any_length(which: str, is_it: bool) -> None:
+    assert is_called("0007-iridium10", "/runs/0007-iridium10", which) is is_it
+
+
+def test_link_to_itself_is_no_run(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+
+    assert not is_called("0007-iridium10", "/runs/0007-iridium10", str(tmp_path / "loop"))
+
+
 def test_dead_process_is_not_listed(start: Start) -> None:
     process = start("0001-a", "host", "host")
     process.kill()

@@ -26,11 +26,14 @@ LOST = MachineFailure(FailureKind.LOST, "broke")
 class PlayedConnection:
     def __init__(self, boot_id: str = "") -> None:
         self.target = TARGET
+        self.exit_status = int(boot_id.startswith("refused"))
         self.boot_id = boot_id
         self.is_closed = False
 
     def run(self, command: str, *, timeout_s: float, said_bytes_max: int) -> Completed:
-        return Completed(exit_status=0, stdout=f"{self.boot_id}\n".encode(), stderr=b"")
+        return Completed(
+            exit_status=self.exit_status, stdout=f"{self.boot_id}\n".encode(), stderr=b""
+        )
 
     def close(self) -> None:
         self.is_closed = True
@@ -102,6 +105,12 @@ def test_machine_is_back_when_another_boot_answers(board: type[PlayedBoard]) -> 
     assert (done.boot_id, done.back_s) == ("new", 4.0)
     assert board.asked == ["boot", "lock", "reboot"]
     assert connection.is_closed
+
+
+def test_words_of_a_machine_that_runs_nothing_yet_are_no_boot(board: type[PlayedBoard]) -> None:
+    done = rebooting("refused: it is starting", "new").reboot(PlayedConnection())  # type: ignore[arg-type]
+
+    assert (done.boot_id, done.back_s) == ("new", 2.0)
 
 
 def test_connection_that_breaks_on_the_order_is_no_failure(board: type[PlayedBoard]) -> None:

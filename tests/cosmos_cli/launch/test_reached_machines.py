@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from cosmos_cli.errors import InputError
-from cosmos_cli.fleet.connection import Connection, ConnectOptions
+from cosmos_cli.fleet.connection import Completed, Connection, ConnectOptions
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.target import Target
@@ -59,3 +59,19 @@ def test_two_folders_on_one_machine_are_two_machines(opened, tmp_path):
     close_machines(tuple(machines.values()))
 
     assert list(machines) == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("said", "status", "is_anew"),
+    [("another\n", 0, True), ("", 1, False), ("no room\n", 254, False)],
+)
+def test_only_another_boot_is_a_new_start(opened, tmp_path, said, status, is_anew):
+    machines = reached(opened, {"a": tmp_path})
+    (machine,) = machines.values()
+    assert not machine.has_started_anew()
+
+    told = Completed(exit_status=status, stdout=said.encode(), stderr=b"")
+    machine.connection.run = lambda command, timeout_s: told
+
+    assert machine.has_started_anew() is is_anew
+    close_machines(tuple(machines.values()))

@@ -171,6 +171,18 @@ def test_nobody_sees_a_half_written_file(tmp_path, monkeypatch):
     assert seen == [("old", "new")]
 
 
+@pytest.mark.parametrize("root", ["usb", "usb/cosmos"])
+def test_folder_on_a_disk_that_is_not_mounted_is_told_as_such(tmp_path, root):
+    (tmp_path / "usb").symlink_to("/nowhere/usb")
+
+    with pytest.raises(
+        HelperRefusal, match=r"/usb: a link that leads nowhere \(/nowhere/usb\)"
+    ) as it:
+        facts.facts(VerbRequest(arguments={"root": str(tmp_path / root)}))
+
+    assert "mount what it leads to" in it.value.advice
+
+
 def test_unknown_owner_and_special_files_are_refused(tmp_path):
     with pytest.raises(HelperRefusal, match="there is no user 'nobody-here'"):
         replace_file(str(tmp_path / "a"), b"", {"owner": "nobody-here"})

@@ -15,7 +15,13 @@ from made_wheels import make_wheel
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.provision import wheels
-from cosmos_cli.provision.wheels import own_wheel, with_own_wheels
+from cosmos_cli.provision.wheels import (
+    UNUSED_S_MAX,
+    own_wheel,
+    remove_unused,
+    with_own_wheels,
+)
+from cosmos_cli.system import ownership
 
 SCENARIO = "name: a\nsimulation: counter\nagents: {count: 1}\nrequirements: ["
 
@@ -82,6 +88,39 @@ def test_a_wheel_that_left_the_cache_is_built_again(folder):
 
     assert len(builds) == 2
     assert own_wheel(text)[1].is_file()
+
+
+def test_note_of_another_user_of_what_was_built_is_not_believed(folder, cache, monkeypatch):
+    uid = folder.stat().st_uid
+    with_own_wheels(["./cars"], folder)
+    monkeypatch.setattr(ownership, "ROOT", uid + 1)
+    monkeypatch.setattr(os, "geteuid", lambda: uid + 2)
+
+    with_own_wheels(["./cars"], folder)
+
+    assert builds == ["./cars", "./cars"]
+
+
+def test_note_of_what_was_built_goes_when_nobody_wanted_it_for_long(folder, cache):
+    with_own_wheels(["./cars"], folder)
+    (note,) = (cache / "built").iterdir()
+    os.utime(note, (1000.0, 1000.0))
+
+    with_own_wheels(["./cars"], folder)
+    remove_unused(cache, now_s=note.stat().st_mtime + UNUSED_S_MAX)
+    assert note.exists(), "it was just used"
+
+    remove_unused(cache, now_s=note.stat().st_mtime + UNUSED_S_MAX + 1.0)
+    assert not note.exists()
+
+
+def test_damaged_note_of_what_was_built_is_written_anew(folder, cache):
+    first = with_own_wheels(["./cars"], folder)
+    (note,) = (cache / "built").iterdir()
+    note.write_bytes(b"\xff\xfe")
+
+    assert with_own_wheels(["./cars"], folder) == first
+    assert note.read_bytes() != b"\xff\xfe"
 
 
 @pytest.mark.process

@@ -22,7 +22,7 @@ from cosmos_cli.provision import sent_wheels
 from cosmos_cli.provision.lock import Locked
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.provision.sent_wheels import sent_wheel
-from cosmos_cli.system import file_lock
+from cosmos_cli.system import file_lock, ownership
 
 HERE = Platform(python=sys.version_info[:2], machine="x86_64", libc_version=(2, 36))
 OTHER = dataclasses.replace(HERE, python=(3, 99))
@@ -119,6 +119,21 @@ def test_it_is_made_once_and_again_when_it_is_gone(made):
     assert when_ns == unchanged_ns
     assert hashlib.sha256(third.path.read_bytes()).hexdigest() == third.locked.sha256
     assert third.is_verified
+
+
+def test_wheel_that_another_user_packed_is_not_believed(made, monkeypatch):
+    path, locked = made("numpy")
+    packed = sent_wheel(path, locked, OTHER)
+    forged = b"forged"
+    packed.path.write_bytes(forged)
+    (packed.path.parent / sent_wheels.NOTE).write_text(
+        json.dumps({"sha256": hashlib.sha256(forged).hexdigest(), "size_bytes": len(forged)})
+    )
+    uid = path.stat().st_uid
+    monkeypatch.setattr(ownership, "ROOT", uid + 1)
+    monkeypatch.setattr(os, "geteuid", lambda: uid + 2)
+
+    assert sent_wheel(path, locked, OTHER).path.read_bytes() != forged
 
 
 def test_wheel_that_record_contradicts_is_sent_as_it_came(made):
