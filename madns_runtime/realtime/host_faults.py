@@ -8,6 +8,7 @@ from time import monotonic
 from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.faults.message_faults import MessageEnds, MessageFaults
 from madns_runtime.protocol.messages import AgentFault, Service
+from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_core import RealtimeCore
 from madns_runtime.timeline import fault_kinds as words
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
@@ -129,6 +130,8 @@ class HostFaults:
         self._timer.reschedule(math.inf if next_s is None or t0_s is None else t0_s + next_s)
 
     def _due(self) -> None:
+        if not self._port.is_in(HostState.SIMULATION_START):
+            return  # what waits still is left: the half may have made its summary
         self._messages.release()
         self._arm()
         self._pump()
