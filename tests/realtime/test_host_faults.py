@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from madns_runtime.protocol.host_peers import INCARNATIONS_MAX
 from madns_runtime.protocol.messages import AgentFault, Service
 from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_faults import HostFaults
@@ -77,6 +78,18 @@ def test_one_that_was_killed_and_is_back_can_be_killed_again() -> None:
         faults.begin(an_action(2, "hang", "a"))
 
     assert [order.number for _, order in session.sent] == [0, 1]
+
+
+def test_an_agent_that_no_host_would_take_back_again_is_not_sent_away_to_return() -> None:
+    faults, session = some_faults()
+    session.peers["a"].incarnations_seen = list(range(INCARNATIONS_MAX))
+
+    with pytest.raises(ActionRefused, match="a: started 128 times, as often as a run takes one"):
+        faults.begin(an_action(0, "restart", "a"))
+    assert faults.begin(an_action(1, "kill", "a", "b", for_s=1.0)) == ["a"]
+    assert faults.begin(an_action(2, "kill", "a")) == [], "it is not to return"
+
+    assert [(agent, order.number) for agent, order in session.sent] == [("b", 1), ("a", 2)]
 
 
 def test_what_a_fault_holds_beyond_the_end_is_not_handed_in_after_the_summary() -> None:
