@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from time import monotonic
 
 from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.faults.message_faults import MessageEnds, MessageFaults
+from madns_runtime.protocol.host_peers import INCARNATIONS_MAX
 from madns_runtime.protocol.messages import AgentFault, Service
+from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_core import RealtimeCore
 from madns_runtime.timeline import fault_kinds as words
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
@@ -81,8 +84,13 @@ class HostFaults:
         returns_s = None if after_s is None else self._port.now_s() + after_s
         why = words.killed_words(action)
         value = math.nan if after_s is None else after_s
-        absent = []
-        for agent in action.agents:
+        absent = [] if after_s is None else self._worn_out(action.agents)
+        if absent and len(absent) == len(action.agents):
+            names = ", ".join(absent)
+            raise ActionRefused(
+                f"{names}: started {INCARNATIONS_MAX} times, as often as a run takes one"
+            )
+        for agent in [name for name in action.agents if name not in absent]:
             order = AgentFault(action.number, action.word, True, value, why)
             # Who is being killed is as good as gone: a second order would not be heard, and says when it returns.
             if not self.intended.is_coming(agent) and self._send(agent, order):
@@ -91,6 +99,11 @@ class HostFaults:
                 absent.append(agent)
         self._port.session.await_returns(self.intended.are_expected(self._duration_s))
         return absent
+
+    def _worn_out(self, agents: Sequence[str]) -> list[str]:
+        """Return those of some agents that the host would not take back once more."""
+        peers = self._port.session.peers
+        return [name for name in agents if len(peers[name].incarnations_seen) >= INCARNATIONS_MAX]
 
     def _order(self, action: TimelineAction, *, begins: bool) -> list[str]:
         """Have agents begin or end a fault of their steps; return who is not there."""
@@ -129,6 +142,8 @@ class HostFaults:
         self._timer.reschedule(math.inf if next_s is None or t0_s is None else t0_s + next_s)
 
     def _due(self) -> None:
+        if not self._port.is_in(HostState.SIMULATION_START):
+            return  # what waits still is left: the half may have made its summary
         self._messages.release()
         self._arm()
         self._pump()

@@ -292,6 +292,7 @@ class Supervisor:
         if self._is_ending:
             self._reap()
         elif self._operator.is_cut:  # it comes back first, or all is over
+            child.returns_after_s = RESTART_DELAY_S
             self._restart_soon(child)
         else:
             try:

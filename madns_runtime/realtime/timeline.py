@@ -112,7 +112,10 @@ class HostTimeline:
 
     def _arm(self) -> None:
         next_s, t0_s = 0.0 if self._early else self.runner.next_s, self._port.t0_s
-        self._timer.reschedule(math.inf if next_s is None or t0_s is None else t0_s + next_s)
+        if next_s is None or t0_s is None or next_s > self._report.duration_s:
+            self._timer.reschedule(math.inf)
+        else:
+            self._timer.reschedule(t0_s + next_s)
 
     def _due(self) -> None:
         if self._port.is_in(HostState.SIMULATION_START):
@@ -120,7 +123,8 @@ class HostTimeline:
             early, self._early = self._early, []
             for met in early:
                 self.runner.met(met.condition.number, met.t_s, now_s)
-            self.runner.run_due(now_s)
+            # As in lockstep: behind the end, while agents make their summaries, nothing takes place.
+            self.runner.run_due(now_s, until_s=self._report.duration_s)
             self._arm()
             self._pump()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -116,9 +117,16 @@ class TimelineRunner:
             for action in self.in_force
         ]
 
-    def run_due(self, now_s: float) -> None:
-        """Do all that is due up to simulated time *now_s*, in the order of times; at one time what ends comes first."""
-        while (next_s := self.next_s) is not None and next_s <= now_s:
+    def run_due(self, now_s: float, *, until_s: float = math.inf) -> None:
+        """
+        Do all that is due up to now, in the order of times; at one time what ends comes first.
+
+        Args:
+            now_s: Simulated time, s.
+            until_s: The end of the run, s: what is due behind it never takes place.
+        """
+        due_by_s = min(now_s, until_s)
+        while (next_s := self.next_s) is not None and next_s <= due_by_s:
             if self._ends and self._ends[0][0] <= next_s:
                 due_s, _, action = heapq.heappop(self._ends)
                 self._dispatcher.end(action, due_s, now_s)

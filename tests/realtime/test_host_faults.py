@@ -5,7 +5,9 @@ from typing import Any
 
 import pytest
 
-from madns_runtime.protocol.messages import AgentFault
+from madns_runtime.protocol.host_peers import INCARNATIONS_MAX
+from madns_runtime.protocol.messages import AgentFault, Service
+from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_faults import HostFaults
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
 
@@ -76,3 +78,69 @@ def test_one_that_was_killed_and_is_back_can_be_killed_again() -> None:
         faults.begin(an_action(2, "hang", "a"))
 
     assert [order.number for _, order in session.sent] == [0, 1]
+
+
+def test_an_agent_that_no_host_would_take_back_again_is_not_sent_away_to_return() -> None:
+    faults, session = some_faults()
+    session.peers["a"].incarnations_seen = list(range(INCARNATIONS_MAX))
+
+    with pytest.raises(ActionRefused, match="a: started 128 times, as often as a run takes one"):
+        faults.begin(an_action(0, "restart", "a"))
+    assert faults.begin(an_action(1, "kill", "a", "b", for_s=1.0)) == ["a"]
+    assert faults.begin(an_action(2, "kill", "a")) == [], "it is not to return"
+
+    assert [(agent, order.number) for agent, order in session.sent] == [("b", 1), ("a", 2)]
+
+
+def test_what_a_fault_holds_beyond_the_end_is_not_handed_in_after_the_summary() -> None:
+    now_s, handed_in = [10.0], []
+    state = [HostState.SIMULATION_START]
+    timer = SimpleNamespace(reschedule=lambda when_s: None)
+    config = SimpleNamespace(
+        on_agent_loss="continue",
+        time=SimpleNamespace(duration_s=60.0),
+        seed=1,
+        agents=SimpleNamespace(resolved_names=lambda: ("a", "b")),
+    )
+    half = SimpleNamespace(
+        take_now=lambda agent, message: handed_in.append(message),
+        carrier=SimpleNamespace(faults=None),
+        intake=None,
+    )
+    core: Any = SimpleNamespace(
+        launch=SimpleNamespace(config=config),
+        port=SimpleNamespace(
+            session=Session(),
+            now_s=lambda: now_s[0],
+            send=None,
+            t0_s=0.0,
+            is_in=lambda wanted: state[0] is wanted,
+            faults=None,
+        ),
+        half=half,
+        guard=lambda call, *arguments: call(*arguments),
+        pump=lambda: None,
+        reactor=SimpleNamespace(call_at=lambda when_s, call: timer),
+    )
+    faults = HostFaults(core)
+    action = TimelineAction(
+        number=0,
+        word="delay_messages",
+        agents=("a",),
+        parameters={"delay_s": 1.0, "jitter_s": 0.0, "traffic": "with_host"},
+        t_s=10.0,
+        for_s=None,
+    )
+    faults.begin(action)
+    for message in ("in time", "too late"):
+        half.intake("a", message, Service.BEST)
+        now_s[0] += 0.5
+
+    now_s[0] = 11.2
+    faults._due()
+    state[0], now_s[0] = HostState.BEGIN_SHUTDOWN, 12.0
+    faults._due()
+
+    assert handed_in == ["in time"]
+    with_host = faults.to_mapping()["with_host"]
+    assert (with_host["late"], with_host["released"], with_host["left"]) == (2, 1, 1)

@@ -19,6 +19,7 @@ class Session:
         self.heard: list[tuple[str, str, float]] = []
         self.awaited: list[bool] = []
         self.end_host_s = 0.0
+        self.peers = {name: SimpleNamespace(incarnations_seen=[1]) for name in ("a", "b")}
 
     def send(self, agent: str, order: Any, *_: Any) -> bool:
         if agent in self.away:
@@ -157,3 +158,20 @@ def test_what_waits_for_a_condition_that_is_met_in_set_up_takes_place_at_time_ze
     timeline._due()
 
     assert events.words == ["condition_met", "action_began"]
+
+
+def test_what_would_end_behind_the_run_is_ordered_of_no_agent_that_has_made_its_summary() -> None:
+    session, events = Session(), Events()
+    timeline, core = a_timeline(
+        session,
+        ScheduledEntry(action="hang", at_s=59.0, for_s=1.0, agents=("a",)),
+        ScheduledEntry(action="hang", at_s=59.5, for_s=0.7, agents=("a",)),
+        events=events,
+    )
+
+    for now_s in (59.8, 60.3):  # others have still to tell that they are complete
+        core.port.now_s = lambda now_s=now_s: now_s
+        timeline._due()
+
+    assert events.words == ["action_began", "action_began", "action_ended"]
+    assert [word for _, word, _ in session.heard] == ["hang"] * 3
