@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -22,6 +23,8 @@ from madns_runtime.hardware.status import StatusAccount, StatusLimits
 from madns_runtime.plugin.context import describe_exception
 
 RECORDS_TIMEOUT_S: Final = 10.0
+ROUNDING: Final = 1e-9
+"""Of a time in periods: 0.3 s are three of 0.1 s."""
 SAMPLES_MAX: Final = 1_000_000
 """In one tick, outputs with them: more means that a driver never lets time go on."""
 
@@ -96,13 +99,29 @@ class InlineDevice:
         return True
 
     def open(self) -> None:
-        """Open it at simulated time 0."""
+        """Open it at simulated time 0, or where that is over, in an agent's return to another process, at the present."""
+        now_s = self._handed_s = max(self._now_s(), 0.0)
         identity = identity_of(self._call("open", self._device.open))
         header = self._page.header
-        header[page.STATE], header[page.OPENED_S] = page.OPEN, 0.0
+        header[page.STATE], header[page.OPENED_S] = page.OPEN, now_s
         self._records.time.set(0.0, 0.0, 1.0)
-        self._records.event("opened", 0.0, identity=identity)
+        self._records.event("opened", now_s, identity=identity)
         self._account.begin(0.0)
+        if now_s > 0.0:
+            self._pass_over(now_s)
+
+    def _pass_over(self, t_s: float) -> None:
+        """Leave out what it had to tell before it was opened: a recording goes on, and does not begin anew."""
+        self._count = math.ceil(t_s * self._rate_hz - ROUNDING)
+        for _ in range(SAMPLES_MAX):
+            next_s = self._call("next_s", next_of, self._device)
+            if next_s is None or next_s >= t_s:
+                return
+            sample = self._call("sample_at", self._device.sample_at, max(next_s, 0.0))
+            self._intake.count("passed_while_closed", int(sample is not None))
+        raise PluginError(
+            f"device {self.name}: {SAMPLES_MAX} samples before {t_s:g} s, and no end: {STANDS_STILL}"
+        )
 
     def advance(self, t_s: float) -> None:
         """

@@ -327,6 +327,10 @@ class Hardware(Mapping[str, DevicePort]):
                 found.append((name, status))
         return found
 
+    def forget_statuses(self) -> None:
+        """Forget which statuses `changes` has told: the agent has returned, and knows of none."""
+        self._statuses = dict.fromkeys(self._ports, "never")
+
     def order_fault(self, order: FaultOrder) -> None:
         """Have a fault inserted around a device; `report` tells what became of it."""
         for port in self._ports.values():

@@ -49,7 +49,10 @@ class WorkerLosses:
 
     def devices_of(self, index: int) -> AgentDevices | None:
         """Return the open devices of an agent that returns; None if this worker never had them."""
-        return self._devices.pop(index, None)
+        devices = self._devices.pop(index, None)
+        if devices is not None:
+            devices.hardware.forget_statuses()
+        return devices
 
     def follow_devices(self, t_s: float) -> None:
         """Let the devices of lost agents go on to simulated time *t_s*."""

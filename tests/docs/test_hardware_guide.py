@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import pytest
 from guides import ROOT, blocks, row_keys
@@ -220,6 +221,36 @@ def test_each_kind_has_its_parameters_in_the_guide(name):
     first = section.split("\n\n`")[0]
     listed = set(row_keys(f"\n## Kind\n{first}", "## Kind"))
     assert listed == {field.name for field in dataclasses.fields(parameters)}
+
+
+def classes_of(kind):
+    """Yield a parameters class, and those of its fields, with the types of their fields."""
+    hints = get_type_hints(kind)
+    yield kind, hints
+    for hint in hints.values():
+        for inner in (hint, *get_args(hint)):
+            if isinstance(inner, type) and dataclasses.is_dataclass(inner):
+                yield from classes_of(inner)
+
+
+@pytest.mark.parametrize("name", registered_kinds())
+def test_its_tables_have_the_kinds_own_defaults_and_choices(name):
+    section = GUIDE.split(f"\n### {name}\n", 1)[1].split("\n### ", 1)[0]
+    wrong = []
+    for cls, hints in classes_of(resolve_kind(name, ROOT).parameters):
+        table = section.split(f"\n`{cls.__name__}`, of", 1)[-1].split("\n| parameter ", 1)[1]
+        cells = {
+            row.split("`")[1]: row.split(" | ")
+            for row in table.split("\n\n")[0].strip().split("\n")[2:]
+        }
+        for field in dataclasses.fields(cls):
+            _, kind, default, *_ = cells[field.name]
+            number = field.default
+            if isinstance(number, int | float) and not isinstance(number, bool):
+                wrong += [field.name] * (float(default.strip("`")) != number)
+            if get_origin(hints[field.name]) is Literal:
+                wrong += [w for w in get_args(hints[field.name]) if f"`{w}`" not in kind]
+    assert wrong == []
 
 
 def test_its_limits_are_those_of_the_code():

@@ -38,6 +38,21 @@ def test_two_lockstep_runs_with_devices_record_the_same(tmp_path):
     assert list(cosmos.directory(first).glob("devices/agent-01/gps/value.jsonl"))
 
 
+def test_an_agent_that_returns_is_told_of_its_devices_status(tmp_path):
+    scenario = tmp_path / "even.yaml"
+    loss = "timeline:\n  - {at_s: 1, action: kill, agents: [agent-01], for_s: 0.5}\n"
+    scenario.write_text(f"{SCENARIO}on_agent_loss: continue\n{loss}")
+    cosmos = CosmosCommand(tmp_path)
+
+    _, run = cosmos.run(scenario, *LOOSE)
+
+    folder = cosmos.directory(run) / "agents" / "agent-01"
+    for name, t_s in (("events", 0.0), ("events.2", 1.5)):
+        lines = map(json.loads, (folder / f"{name}.jsonl").read_text().splitlines())
+        told = [(line["t_s"], line["status"]) for line in lines if line.get("event") == "device"]
+        assert told == [(t_s, "ok")]
+
+
 VALVE = """
 from madns_runtime.hardware.contract import Channel, DeviceKind, Sample, SimulatedDevice
 

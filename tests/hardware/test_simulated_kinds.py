@@ -138,26 +138,55 @@ def test_a_playback_recorded_anew_is_the_same_to_the_microsecond(tmp_path):
     assert schema_of(program.channels[0]).name == "gyro"
 
 
+def inline(folder, program):
+    """Return a device in lockstep at 50 Hz that records into a folder, and its clock: a list of one time, s."""
+    recording, clock = CONFIG.recording, [0.0]
+    recorder = Recorder(RecordFiles(folder, run="0002-r", source="agent-01/imu"), recording)
+    journal = RunJournal(recorder, recording.verbosity, t_s=lambda: None)
+    records = DeviceRecords(journal, program.channels)
+    launch = DeviceLaunch(
+        name="imu", place="agent-01", kind=program.kind.name, base_directory="", rate_hz=50.0
+    )
+    device = InlineDevice(launch, program, records, now_s=lambda: clock[0])
+    recorder.start()
+    return device, clock
+
+
+@pytest.mark.parametrize(
+    ("kind", "passed"), [("playback", {"passed_while_closed": 100}), ("synthetic", {})]
+)
+def test_a_device_that_is_opened_in_mid_run_in_lockstep_goes_on_and_does_not_begin_anew(
+    tmp_path, kind, passed
+):
+    record(tmp_path, {"gyro": 0.0, "level": 0.0})
+    given = {"directory": "."} if kind == "playback" else {"channels": CHANNELS, "seed": 3}
+    device, clock = inline(tmp_path / "again", prepare(kind, given, tmp_path))
+    clock[0] = 1.0
+    device.open()
+    for clock[0] in (1.0, 1.11):
+        device.advance(clock[0])
+    told = device.close()
+
+    for name in ("gyro", "level"):
+        rows = [row[:2] for row in read_stream(tmp_path / "again" / f"{name}.jsonl").records()]
+        assert rows == [[t_s, n] for n, t_s in enumerate((1.0, 1.02, 1.04, 1.06, 1.08, 1.1), 1)]
+    assert {key: told[key] for key in told if key.startswith("passed")} == passed
+    opened = next(iter(read_stream(tmp_path / "again" / "events.jsonl").records()))
+    assert (opened["event"], opened["t_s"]) == ("opened", 1.0)
+
+
 def test_a_sample_that_was_handed_on_before_its_own_time_is_played_back_in_lockstep(tmp_path):
     record(tmp_path, {"gyro": -0.0015, "level": 0.0})
     program = prepare("playback", {"directory": "."}, tmp_path)
-    again, recording = tmp_path / "again", CONFIG.recording
-    recorder = Recorder(RecordFiles(again, run="0002-r", source="agent-01/imu"), recording)
-    journal = RunJournal(recorder, recording.verbosity, t_s=lambda: None)
-    launch = DeviceLaunch(
-        name="imu", place="agent-01", kind="playback", base_directory="", rate_hz=50.0
-    )
-    device = InlineDevice(
-        launch, program, DeviceRecords(journal, program.channels), now_s=lambda: 4.0
-    )
-    recorder.start()
+    device, clock = inline(tmp_path / "again", program)
     device.open()
+    clock[0] = 4.0
     device.advance(4.0)
 
     assert device.close()["samples"] == 400
     first, second = (
         [record[2:] for record in read_stream(folder / "gyro.jsonl").records()]
-        for folder in (tmp_path, again)
+        for folder in (tmp_path, tmp_path / "again")
     )
     assert second[1:] == first[1:]  # the first was handed on before simulated time
 
