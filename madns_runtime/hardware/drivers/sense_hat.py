@@ -39,7 +39,8 @@ class SenseHatDevice(Device):
             raise MachineError(f"{error.name} is not installed; {cure}") from None
         try:
             self._hat: Any = make()
-            self._hat.set_rotation(p.rotation)
+            # Redrawn, the picture that is shown would be turned, also where outputs may not move.
+            self._hat.set_rotation(p.rotation, redraw=False)
             self._hat.set_imu_config(p.magnetometer, p.gyroscope, p.accelerometer)
         except OSError as error:
             cure = "start sense_emu_gui" if p.emulated else "is it plugged in?"
