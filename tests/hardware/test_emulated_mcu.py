@@ -242,7 +242,9 @@ def test_emulator_that_says_much_goes_on_and_its_last_words_are_told(tmp_path, i
     program.chmod(0o700)
     parameters = {"program": str(program), "sensors": [], "held_hz": 100}
     with (
-        pytest.raises(MachineError, match="the emulator is gone.*it said: 'qemu-system-arm: the end'"),
+        pytest.raises(
+            MachineError, match="the emulator is gone.*it said: 'qemu-system-arm: the end'"
+        ),
         opened("emulated_mcu", firmware=image, **parameters) as mcu,
     ):
         wait_until(lambda: mcu.read() and False)

@@ -83,7 +83,12 @@ def frame_of(text: str) -> tuple[int, bytes]:
         mark = ""
     is_extended = len(number) > STANDARD_DIGITS
     # What else int() takes, such as 0x123, would become an identifier of 29 bits.
-    if not mark or not IDENTIFIER.fullmatch(number) or identifier >> (29 if is_extended else 11) or len(data) > DATA_BYTES_MAX:
+    if (
+        not mark
+        or not IDENTIFIER.fullmatch(number)
+        or identifier >> (29 if is_extended else 11)
+        or len(data) > DATA_BYTES_MAX
+    ):
         raise PluginError(f"safe_frames_hex: expected a frame such as 123#00FF, got {text!r}")
     return identifier | (EXTENDED if is_extended else 0), data
 
