@@ -202,7 +202,10 @@ def test_an_interface_that_is_down(kernel):
         pass
 
 
-@pytest.mark.parametrize("text", ["123", "xyz#00", "123#0", "FFF#00", "123#" + "00" * 9, "#"])
+@pytest.mark.parametrize(
+    "text",
+    ["123", "xyz#00", "123#0", "FFF#00", "123#" + "00" * 9, "#", "0x123#00", "1_23#00", " 123#00", "#00"],
+)  # fmt: skip
 def test_a_safe_frame_that_is_none_is_refused_before_the_run(text):
     with pytest.raises(PluginError, match="safe_frames_hex: expected a frame such as 123#00FF"):
         prepare("can", {"safe_frames_hex": [text]}, None)

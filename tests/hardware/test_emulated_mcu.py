@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
 import time
 from collections import Counter
 from functools import partial
@@ -219,6 +220,34 @@ def test_missing_emulator_is_told_with_what_installs_it(image):
         opened("emulated_mcu", firmware=image, program="qemu-system-nothing"),
     ):
         pass
+
+
+TALKATIVE = """#!{python}
+import json, os, re, socket, sys
+line = socket.socket(fileno=int(re.search(r"id=monitor,fd=([0-9]+)", " ".join(sys.argv)).group(1)))
+line.sendall(b'{{"QMP": {{}}}}\\n')
+for number, asked in enumerate(line.makefile()):
+    os.write(2, b"display: unknown command\\n" * 400)
+    if number == 40:
+        os.write(2, b"qemu-system-arm: the end\\n")
+        sys.exit(1)
+    line.sendall(b'{{"return": {{}}}}\\n')
+"""
+"""As an emulator whose model of a display tells each command that it does not know."""
+
+
+def test_emulator_that_says_much_goes_on_and_its_last_words_are_told(tmp_path, image):
+    program = tmp_path / "talkative"
+    program.write_text(TALKATIVE.format(python=sys.executable))
+    program.chmod(0o700)
+    parameters = {"program": str(program), "sensors": [], "held_hz": 100}
+    with (
+        pytest.raises(
+            MachineError, match="the emulator is gone.*it said: 'qemu-system-arm: the end'"
+        ),
+        opened("emulated_mcu", firmware=image, **parameters) as mcu,
+    ):
+        wait_until(lambda: mcu.read() and False)
 
 
 def test_value_that_the_model_refuses_is_told(image):

@@ -45,8 +45,9 @@ class SenseHat:
         self.raw = {"x": 0.0, "y": 0.0, "z": 1.0}
         SenseHat.made.append(self)
 
-    def set_rotation(self, degrees):
-        self.rotation = degrees
+    def set_rotation(self, r=0, redraw=True):
+        self.rotation = r
+        self.has_redrawn = redraw
 
     def set_imu_config(self, compass_enabled, gyro_enabled, accel_enabled):
         self.imu = (compass_enabled, gyro_enabled, accel_enabled)
@@ -133,6 +134,28 @@ def test_a_picture_is_shown_and_switched_off(hats):
         assert hats[0].pixels[63] == [189, 190, 191]
         device.make_safe()
         assert hats[0].pixels == [[0, 0, 0]] * 64
+
+
+def test_joystick_that_is_held_while_it_is_read_rarely_keeps_a_bounded_number_of_events(hats):
+    counts = {}
+    with opened("sense_hat") as device:
+        device.count = lambda name, number: counts.update({name: counts.get(name, 0) + number})
+        held = [SimpleNamespace(direction="up", action="held")] * 999
+        hats[0].stick.events = [SimpleNamespace(direction="up", action="pressed"), *held]
+        assert device.read().values["joystick"] == (0, 2)  # the oldest give way
+        kept = 1
+        while "joystick" in device.read().values:
+            kept += 1
+    assert kept == 256
+    assert counts["joystick_lost"] == 1000 - kept
+
+
+@pytest.mark.parametrize("may_move", [True, False])
+def test_opening_it_leaves_the_picture_as_it_is(hats, may_move):
+    """By default the library reads the picture that is shown, and draws it anew, turned."""
+    with opened("sense_hat", may_move=may_move, rotation=90):
+        assert hats[0].rotation == 90
+        assert not hats[0].has_redrawn
 
 
 def test_a_missing_library_or_hat_is_told_with_its_cure(hats, monkeypatch):

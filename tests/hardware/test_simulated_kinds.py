@@ -259,4 +259,36 @@ def test_recorded_outputs_take_what_they_are_given_and_limits_are_told(tmp_path)
     device = program.make()
     device.open()
     device.write({"duty": 0.5}, 0.0)
-    assert device.next_s() == math.inf
+
+
+def test_a_recording_of_as_many_channels_as_a_device_has_is_played_back_whole(tmp_path):
+    channels = [{"name": f"value{number:02d}"} for number in range(64)]
+    program = prepare("synthetic", {"channels": channels}, None)
+    recorder = Recorder(RecordFiles(tmp_path, run="0001-r", source="pi22/imu"), CONFIG.recording)
+    journal = RunJournal(recorder, CONFIG.recording.verbosity, t_s=lambda: None)
+    records = DeviceRecords(journal, program.channels)
+    recorder.start()
+    records.set_time(1000.0, 0.0, 1.0)
+    records.event("opened", 1000.0)
+    records.state(1000.0, (1, 0), 0, {})
+    records.clock(1000.0, 0.0, 0.0)
+    for channel in program.channels:
+        records.sample(channel.name, 1, 1000.0, (0.5,), told_s=1000.0)
+    records.close(5.0)
+    assert len(list(tmp_path.glob("*.jsonl"))) > 64  # what is recorded beside channels
+
+    again = prepare("playback", {"directory": "."}, tmp_path)
+
+    assert [channel.name for channel in again.channels] == [each["name"] for each in channels]
+
+
+def test_a_recording_of_outputs_alone_is_a_device_that_is_there(tmp_path):
+    """A device of outputs alone says so by samples without a value; of these there are no records."""
+    fields = [("t_s", "s"), ("lateness_us", "us"), ("duty", "1")]
+    told = ",".join(f'{{"name":"{name}","unit":"{unit}","kind":"float"}}' for name, unit in fields)
+    (tmp_path / "duty.jsonl").write_text(
+        f'{{"schema":1,"stream":"duty","shape":"array","fields":[{told}]}}\n[0.5,10,0.25]\n'
+    )
+    with opened("playback", tmp_path, directory=".") as device:
+        assert device.next_s() is None  # at its rate
+        assert device.sample_at(1.5) == Sample(values={}, taken_s=1.5)

@@ -40,6 +40,9 @@ ELF_LITTLE: Final = b"\x01"
 ELF_MACHINE: Final = slice(18, 20)
 ELF_ARM: Final = 40
 WORDS_BYTES_MAX: Final = 4096
+"""Of what the emulator says on standard error: the end of it is kept."""
+WORDS_READS_MAX: Final = 32
+"""At a time: a pipe holds half as much."""
 UNSENT_BYTES_MAX: Final = 65_536
 """Of the serial line that the emulator has not taken yet."""
 
@@ -101,7 +104,8 @@ class EmulatedMcu(Device):
             self._monitor.begin(monotonic() + START_S)
         except MachineError as error:
             raise MachineError(f"{error}{self._words()}") from None
-        for descriptor in (self._serial.fileno(), self._monitor.fileno(), self._timer.fd):
+        lines = (self._serial.fileno(), self._monitor.fileno(), self._timer.fd, self._words_fd())
+        for descriptor in lines:
             self._poll.register(descriptor, select.EPOLLIN)
         self._held_s = monotonic()
         self._set_timer()
@@ -122,6 +126,7 @@ class EmulatedMcu(Device):
             self._monitor.poll()
         except MachineError as error:
             raise MachineError(f"{error}{self._words()}") from None
+        self._take_words()
         self._push()
         now_s = monotonic()
         if now_s >= self._held_s:
@@ -300,13 +305,27 @@ class EmulatedMcu(Device):
         self._is_asked = False
         return values
 
+    def _words_fd(self) -> int:
+        assert self._process is not None
+        assert self._process.stderr is not None
+        return self._process.stderr.fileno()
+
+    def _take_words(self) -> None:
+        """Take what the emulator says on standard error: with a pipe that is full it would stand still."""
+        fd = self._words_fd()
+        with contextlib.suppress(OSError):
+            for _ in range(WORDS_READS_MAX):
+                data = os.read(fd, WORDS_BYTES_MAX)
+                if not data:  # closed, and readable from now on
+                    self._poll.unregister(fd)
+                    return
+                self._said = (self._said + data)[-WORDS_BYTES_MAX:]
+
     def _words(self) -> str:
         """Return what the emulator said of its end on standard error: its first line of its own, else the last one."""
-        if self._process is None or self._process.stderr is None:
+        if self._process is None:
             return ""
-        with contextlib.suppress(OSError):
-            while data := os.read(self._process.stderr.fileno(), WORDS_BYTES_MAX):
-                self._said = (self._said + data)[:WORDS_BYTES_MAX]
+        self._take_words()
         lines = self._said.decode(errors="replace").strip().splitlines()
         own = [line for line in lines if line.startswith("qemu") and "warning:" not in line]
         said = (own or lines[-1:] or [""])[0]

@@ -25,10 +25,12 @@ class PlaybackDevice(SimulatedDevice):
         """Begin the recording."""
         start_s, has_ticks = self.parameters.start_s, self.parameters.tick_hz is not None
         found_at = _finder(self.parameters)
+        channels = streams_of(self.parameters.directory)
+        self._has_inputs = any(channel.direction == "in" for channel, _ in channels)
         self._samples: Iterator[tuple[float, Sample]] = heapq.merge(
             *(
                 self._samples_of(channel, path, start_s, found_at, has_ticks=has_ticks)
-                for channel, path in streams_of(self.parameters.directory)
+                for channel, path in channels
                 if channel.direction == "in"
             ),
             key=lambda pair: pair[0],
@@ -55,15 +57,19 @@ class PlaybackDevice(SimulatedDevice):
         self.count("damaged_lines", stream.state.damaged + stream.state.truncated_lines)
 
     def sample_at(self, t_s: float) -> Sample | None:
-        """Return the next sample that was handed on by *t_s*."""
+        """Return the next sample that was handed on by *t_s*; of outputs alone, which have none on record, that they are there."""
+        if not self._has_inputs:
+            return Sample(values={}, taken_s=t_s)
         if self._next is None or self._next[0] > t_s:
             return None
         sample = self._next[1]
         self._next = next(self._samples, None)
         return sample
 
-    def next_s(self) -> float:
-        """Return when the next sample was handed on."""
+    def next_s(self) -> float | None:
+        """Return when the next sample was handed on; None, for its rate, of a device of outputs alone."""
+        if not self._has_inputs:
+            return None
         return math.inf if self._next is None else self._next[0]
 
     def write(self, values: Mapping[str, Value], due_s: float) -> None:

@@ -16,6 +16,8 @@ DIRECTIONS: Final = ("up", "down", "left", "right", "middle")
 
 
 ACTIONS: Final = ("released", "pressed", "held")
+EVENTS_MAX: Final = 256
+"""Of the joystick that wait, one for each read: one that is held gives some 30 per second."""
 
 
 class SenseHatDevice(Device):
@@ -39,7 +41,8 @@ class SenseHatDevice(Device):
             raise MachineError(f"{error.name} is not installed; {cure}") from None
         try:
             self._hat: Any = make()
-            self._hat.set_rotation(p.rotation)
+            # Redrawn, the picture that is shown would be turned, also where outputs may not move.
+            self._hat.set_rotation(p.rotation, redraw=False)
             self._hat.set_imu_config(p.magnetometer, p.gyroscope, p.accelerometer)
         except OSError as error:
             cure = "start sense_emu_gui" if p.emulated else "is it plugged in?"
@@ -72,6 +75,9 @@ class SenseHatDevice(Device):
                 (DIRECTIONS.index(event.direction), ACTIONS.index(event.action))
                 for event in self._hat.stick.get_events()
             ]
+            lost = max(0, len(self._pending) - EVENTS_MAX)
+            self.count("joystick_lost", lost)
+            del self._pending[:lost]
             if self._pending:
                 values["joystick"] = self._pending.pop(0)
         return Sample(values=values, taken_s=taken_s) if values else None

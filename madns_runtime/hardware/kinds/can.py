@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Final, Literal
 
@@ -19,6 +20,7 @@ HEAD_BYTES: Final = 4
 DATA_BYTES_MAX: Final = 8
 STANDARD_DIGITS: Final = 3
 """Of an identifier of 11 bits; one of 29 bits is written with more."""
+IDENTIFIER: Final = re.compile(r"[0-9A-Fa-f]{1,8}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +82,13 @@ def frame_of(text: str) -> tuple[int, bytes]:
     except ValueError:
         mark = ""
     is_extended = len(number) > STANDARD_DIGITS
-    if not mark or identifier >> (29 if is_extended else 11) or len(data) > DATA_BYTES_MAX:
+    # What else int() takes, such as 0x123, would become an identifier of 29 bits.
+    if (
+        not mark
+        or not IDENTIFIER.fullmatch(number)
+        or identifier >> (29 if is_extended else 11)
+        or len(data) > DATA_BYTES_MAX
+    ):
         raise PluginError(f"safe_frames_hex: expected a frame such as 123#00FF, got {text!r}")
     return identifier | (EXTENDED if is_extended else 0), data
 

@@ -15,6 +15,7 @@ from annotated_types import Ge, Gt
 
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel, DeviceKind
+from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.recording.reader import read_stream
 
 HEAD: Final = ("t_s", "number", "age_us")
@@ -25,9 +26,6 @@ OUTPUT_HEAD: Final = ("t_s", "lateness_us")
 
 FRAME: Final = ("bytes", "data")
 """Further fields of both, if the values are frames."""
-
-
-CHANNELS_MAX: Final = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,9 +73,11 @@ def channels_of(parameters: PlaybackParameters) -> tuple[Channel, ...]:
 
 
 def streams_of(directory: Path) -> list[tuple[Channel, Path]]:
-    """Return the channels of which a folder holds streams, with their files."""
-    found = []
-    for path in sorted(directory.glob("*.jsonl"))[:CHANNELS_MAX]:
+    """Return the channels of which a folder holds streams, with their files: of too many, one more than a device has."""
+    found: list[tuple[Channel, Path]] = []
+    for path in sorted(directory.glob("*.jsonl")):
+        if len(found) > CHANNELS_MAX:
+            break
         fields = read_stream(path).schema.get("fields", ())
         names = tuple(field["name"] for field in fields)
         if not path.stem.isidentifier():
