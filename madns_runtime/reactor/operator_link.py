@@ -217,7 +217,7 @@ class OperatorLink:
         Write what waits; False if the operator did not take it in time.
 
         One that may come back has told of the last event when this is done; if its line ends meanwhile, it has
-        its time to do so.
+        its time to come back, and then *timeout_s* anew.
         """
         if self._door is not None:
             return self._flush_and_hear(self._door, timeout_s)
@@ -342,12 +342,15 @@ class OperatorLink:
             reading = [door.fileno(), *(() if self.is_cut else (self._read_fd,))]
             writing = [self._write_fd] if self._out and not self.is_cut else []
             readable, writable = ready(reading, writing, left_s)
+            was_cut = self.is_cut
             if writable:
                 self._write()
             if door.fileno() in readable:
                 door.step()
             elif readable:
                 self._readable()
+            if was_cut and not self.is_cut:
+                deadline_s = monotonic() + timeout_s
         return not self._kept
 
     # Commands -------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import pytest
@@ -281,6 +282,27 @@ def test_last_event_is_told_although_the_line_breaks_at_the_end(make) -> None:
     assert stage.link.flush(WAIT_S)
     operator.join()
     assert flushed == [True]
+
+
+def test_last_event_is_told_to_an_operator_that_is_back_after_the_time_for_it(
+    make, monkeypatch
+) -> None:
+    stage = make(wait_s=10 * WAIT_S)
+    stage.break_line()
+    stage.link.emit({"event": "finished"})
+    visitor = stage.visit()
+    later_s = iter([0.0])
+    monkeypatch.setattr(operator_link, "monotonic", lambda: monotonic() + next(later_s, 2 * WAIT_S))
+
+    def hear() -> None:
+        said(visitor, 2)
+        visitor.sendall(b'{"command": "seen", "seen": 1}\n')
+
+    operator = threading.Thread(target=hear)
+    operator.start()
+
+    assert stage.link.flush(WAIT_S)
+    operator.join()
 
 
 def test_end_does_not_wait_for_ever_for_an_operator_that_does_not_come(make) -> None:
