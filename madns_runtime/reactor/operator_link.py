@@ -322,6 +322,7 @@ class OperatorLink:
         self._reactor.add_reader(self._read_fd, self._readable)
         self.is_cut = self._is_deaf = self._is_last_call = False
         self._pinged_s = self._reactor.now_s()
+        self._silence_timer.reschedule(self._pinged_s + PING_SILENCE_S)
         self._cut_timer.reschedule(math.inf)
         self._in = b""
         self._out.clear()

@@ -201,6 +201,18 @@ def test_operator_that_does_not_come_back_in_time_is_gone(make) -> None:
     assert stage.link.is_gone
 
 
+def test_operator_that_is_back_and_sends_no_pings_is_gone(make, monkeypatch) -> None:
+    monkeypatch.setattr(operator_link, "PING_SILENCE_S", 0.2)
+    stage = make()
+    stage.break_line()
+    stage.visit()
+    stage.run_until(lambda: stage.attached)
+
+    stage.run_until(lambda: stage.gone)
+
+    assert stage.link.is_gone
+
+
 def test_operator_that_means_the_end_of_its_line_is_gone_at_once(make) -> None:
     stage = make()
     os.write(stage.ends[1], b'{"command": "leave"}\n')
