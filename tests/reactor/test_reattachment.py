@@ -57,14 +57,21 @@ class Stage:
         self.run_until(lambda: self.link.is_cut or self.link.is_gone)
 
     def visit(self, seen: int = 0, **changes: Any) -> socket.socket:
+        visitor = self.knock()
+        self.introduce(visitor, seen, **changes)
+        return visitor
+
+    def knock(self) -> socket.socket:
         visitor = socket.socket(socket.AF_UNIX)
         self.visitors.append(visitor)
         visitor.settimeout(WAIT_S)
         with socket_address(self.directory, OPERATOR_SOCKET.format(1)) as address:
             visitor.connect(address)
+        return visitor
+
+    def introduce(self, visitor: socket.socket, seen: int = 0, **changes: Any) -> None:
         asked = {"command": "attach", "session": SESSION, "incarnation": 1, "seen": seen, **changes}
         visitor.sendall(json.dumps(asked).encode() + b"\n")
-        return visitor
 
     def run_until(self, condition: Callable[[], Any]) -> None:
         until_s = self.reactor.now_s() + WAIT_S
@@ -260,6 +267,20 @@ def test_visitor_that_says_nothing_does_not_keep_others_out(make, monkeypatch) -
         stage.visit()
 
         stage.run_until(lambda: stage.attached)
+
+
+def test_visitor_whose_line_came_while_the_loop_was_busy_is_let_in(make, monkeypatch) -> None:
+    monkeypatch.setattr(reattachment, "ATTACH_LINE_S", 0.2)
+    stage = make()
+    stage.break_line()
+    visitor = stage.knock()
+    stage.run_until(lambda: stage.link._door.is_visited)
+    stage.introduce(visitor)
+    threading.Event().wait(0.4)  # the plug-in's call
+
+    stage.run_until(lambda: stage.attached or not stage.link._door.is_visited)
+
+    assert stage.attached
 
 
 def test_events_that_do_not_fit_are_dropped_oldest_first_and_counted(make, monkeypatch) -> None:
