@@ -148,7 +148,7 @@ class OperatorLink:
         self._cut_until_s = math.inf
         self._cut_timer = reactor.call_at(math.inf, self._given_up)
         self._door: AttachSocket | None = None
-        self._silence_timer = reactor.call_at(math.inf, self._lost)
+        self._silence_timer = reactor.call_at(math.inf, self._fallen_silent)
         os.set_blocking(self._read_fd, False)
         os.set_blocking(self._write_fd, False)
         reactor.add_reader(self._read_fd, self._readable)
@@ -271,6 +271,14 @@ class OperatorLink:
             self._lost()
         else:
             self._cut(self._way_back.wait_s)
+
+    def _fallen_silent(self) -> None:
+        """Take an operator for gone whose pings have ceased; those that came while the loop was busy are heard."""
+        pinged_s = self._pinged_s
+        if ready([self._read_fd], [], 0)[0]:
+            self._readable()
+        if not self.is_gone and not self.is_cut and self._pinged_s == pinged_s:
+            self._lost()
 
     def _lost(self) -> None:
         """Take the operator for gone."""
