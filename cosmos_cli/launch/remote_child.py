@@ -298,8 +298,8 @@ class RemoteChild:
 
     def _fate_known(self, fate: tuple[int | None, bool] | None, failure: Any) -> None:
         status, is_alive = fate or (None, False)
-        if self._is_relayed and status == 0:  # the relay's: nobody knows the program's own
-            self._end(loss=None)
+        if self._is_relayed and status == 0 and self._line.has_greeted:
+            self._end(loss=None)  # the relay's status: nobody knows the program's own
         elif self._is_relayed or (status is None and (self._may_reattach or not is_alive)):
             self._broke("the connection broke")
         else:

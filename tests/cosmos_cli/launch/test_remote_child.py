@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import selectors
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 from harness.waiting import wait_until
 
+from cosmos_cli.fleet.connection import StreamEnd
 from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.background import BackgroundTasks
@@ -112,3 +114,52 @@ def test_program_that_is_gone_behind_a_broken_connection_is_told_as_such(
     wait_for(made, made.child.has_exited)
 
     assert made.child.describe_exit() == "ended as the connection to it broke"
+
+
+class Relay:
+    """A stream whose program says something, ends at once, and ends well."""
+
+    def __init__(self, said: bytes) -> None:
+        self._out, far_end = os.pipe()
+        os.write(far_end, said)
+        os.close(far_end)
+
+    def fileno(self) -> int:
+        return self._out
+
+    def read(self, count: int) -> bytes:
+        return os.read(self._out, count)
+
+    def write(self, data: bytes) -> int:
+        return len(data)
+
+    def ending(self, *, timeout_s: float) -> StreamEnd:
+        return StreamEnd(exit_status=0, errors="")
+
+    def close(self) -> None:
+        os.close(self._out)
+
+
+@pytest.mark.parametrize(
+    ("said", "has_exited"), [(b"", False), (b'{"event": "attached", "commands": 0}\n', True)]
+)
+def test_program_that_has_not_greeted_over_a_new_line_is_not_taken_for_ended(
+    started, tmp_path, monkeypatch, said, has_exited
+):
+    """It turns away whoever does not introduce themselves in time, as over a connection that stands still, and lives on."""
+    made = started(str(tmp_path / "runs" / "0001-c"))
+    monkeypatch.setattr(
+        "cosmos_cli.launch.remote_child._fate", lambda stream, machine: (None, False)
+    )
+    wait_for(made, lambda: any(isinstance(event, LineBroke) for event in made.told))
+    made.told.clear()
+    monkeypatch.setattr("cosmos_cli.launch.remote_child._fate", lambda stream, machine: (0, True))
+    monkeypatch.setattr("cosmos_cli.launch.remote_child._reattach", lambda *_: (Relay(said), b""))
+
+    made.child.reattach()
+    wait_for(
+        made,
+        lambda: made.child.has_exited() or any(isinstance(event, LineBroke) for event in made.told),
+    )
+
+    assert made.child.has_exited() == has_exited
