@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import selectors
+import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -18,7 +19,7 @@ from cosmos_cli.launch.background import BackgroundTasks
 from cosmos_cli.launch.child import RemoteProgram
 from cosmos_cli.launch.machines import MachinePaths
 from cosmos_cli.launch.remote_child import RemoteChild
-from cosmos_cli.launch.run_events import LineBroke, RunEvent
+from cosmos_cli.launch.run_events import LineBroke, Reattached, RunEvent
 
 pytestmark = pytest.mark.process
 
@@ -117,12 +118,14 @@ def test_program_that_is_gone_behind_a_broken_connection_is_told_as_such(
 
 
 class Relay:
-    """A stream whose program says something, ends at once, and ends well."""
+    """A stream whose program says something, and ends well, at once or when its far end is closed."""
 
-    def __init__(self, said: bytes) -> None:
-        self._out, far_end = os.pipe()
-        os.write(far_end, said)
-        os.close(far_end)
+    def __init__(self, said: bytes, *, is_ended: bool = True) -> None:
+        self._out, self.far_end = os.pipe()
+        os.set_blocking(self._out, False)
+        os.write(self.far_end, said)
+        if is_ended:
+            os.close(self.far_end)
 
     def fileno(self) -> int:
         return self._out
@@ -163,3 +166,37 @@ def test_program_that_has_not_greeted_over_a_new_line_is_not_taken_for_ended(
     )
 
     assert made.child.has_exited() == has_exited
+
+
+def test_end_of_a_line_that_another_one_has_replaced_is_none_of_the_program(
+    started, tmp_path, monkeypatch
+):
+    """The program closes the old line for the new one: what became of the old one may be known later than that."""
+    made = started(str(tmp_path / "runs" / "0001-c"))
+    monkeypatch.setattr(
+        "cosmos_cli.launch.remote_child._fate", lambda stream, machine: (None, False)
+    )
+    wait_for(made, lambda: any(isinstance(event, LineBroke) for event in made.told))
+    greeting = b'{"event": "attached", "commands": 0}\n'
+    old, new = Relay(greeting), Relay(greeting, is_ended=False)
+    lines, is_replaced, asked = iter([old, new]), threading.Event(), []
+
+    def fate(stream, machine) -> tuple[int, bool]:
+        asked.append(stream)
+        is_replaced.wait(60.0)
+        return 0, True
+
+    monkeypatch.setattr("cosmos_cli.launch.remote_child._fate", fate)
+    monkeypatch.setattr("cosmos_cli.launch.remote_child._reattach", lambda *_: (next(lines), b""))
+    made.child.reattach()
+    wait_for(made, lambda: asked)
+    made.told.clear()
+    made.child.reattach()
+    wait_for(made, lambda: any(isinstance(event, Reattached) for event in made.told))
+    made.told.clear()
+
+    is_replaced.set()
+    wait_for(made, lambda: not made.background.pending)
+
+    assert (asked, made.child.has_exited(), made.told) == ([old], False, [])
+    os.close(new.far_end)
