@@ -210,7 +210,8 @@ class OperatorLink:
     def is_silent(self) -> bool:
         """Whether an operator that sends pings has not done so for a while, though its line stands."""
         is_late = self._reactor.now_s() - self._pinged_s > PING_LATE_S
-        return is_late and not self._is_detached and not self.is_cut
+        is_watched = not self._is_detached and not self.is_cut
+        return is_late and is_watched and not ready([self._read_fd], [], 0)[0]
 
     def flush(self, timeout_s: float) -> bool:
         """

@@ -263,6 +263,8 @@ def test_operator_is_late_when_its_pings_are(reactor, pipes, monkeypatch):
 
     assert seen[0] is False
     assert seen[-1] is True
+    os.write(pipes[1], b'{"command": "ping", "n": 2}\n')  # and the loop has not come to read it
+    assert line.is_silent is False
 
 
 def test_end_that_comes_a_moment_later_is_waited_for(reactor, pipes):
