@@ -294,12 +294,18 @@ class RemoteChild:
         if failure is not None:
             self._broke(failure.text)
         else:
-            self._background.submit(partial(_fate, stream, self._machine), self._fate_known)
+            self._background.submit(
+                partial(_fate, stream, self._machine), partial(self._fate_known, stream)
+            )
 
-    def _fate_known(self, fate: tuple[int | None, bool] | None, failure: Any) -> None:
+    def _fate_known(
+        self, stream: Stream, fate: tuple[int | None, bool] | None, failure: Any
+    ) -> None:
+        if stream is not self._stream:  # the program has closed that line for another one
+            return
         status, is_alive = fate or (None, False)
-        if self._is_relayed and status == 0:  # the relay's: nobody knows the program's own
-            self._end(loss=None)
+        if self._is_relayed and status == 0 and self._line.has_greeted:
+            self._end(loss=None)  # the relay's status: nobody knows the program's own
         elif self._is_relayed or (status is None and (self._may_reattach or not is_alive)):
             self._broke("the connection broke")
         else:

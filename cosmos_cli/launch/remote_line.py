@@ -45,6 +45,8 @@ class RemoteLine:
         self._channel: StreamChannel | None = None
         self._is_ready = False
         self._is_closed = False
+        self.has_greeted = False
+        """Whether the program has told over the newest stream that it takes it."""
         self._commands: deque[dict[str, Any]] = deque(maxlen=COMMANDS_KEPT_MAX)
         self._count = 0
         self.seen = 0
@@ -95,7 +97,7 @@ class RemoteLine:
     def _use(self, stream: Stream) -> StreamChannel:
         if self._channel is not None:
             self._channel.close()
-        self._is_ready = False
+        self._is_ready = self.has_greeted = False
         self._channel = StreamChannel(
             self._selector, stream, on_line=self._heard, on_end=self._ended
         )
@@ -120,6 +122,7 @@ class RemoteLine:
         except (orjson.JSONDecodeError, AttributeError, TypeError, ValueError, OverflowError):
             event, number, commands = {}, 0, 0
         if event.get("event") == "attached":
+            self.has_greeted = True
             self._send_from(commands)
         elif number == 0:
             self._on_line(line)

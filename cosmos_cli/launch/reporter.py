@@ -8,6 +8,7 @@ from typing import Any
 from cosmos_cli.evidence.run_documents import Problem
 from cosmos_cli.launch.events import Logged, Noise, Progress, StateChanged
 from cosmos_cli.launch.request import View
+from cosmos_cli.ui.plural import counted
 
 NOISE_LINES_MAX = 20
 """Lines of a child that are no events are shown this often, then only counted."""
@@ -29,14 +30,25 @@ class Reporter:
     def __init__(self, view: View) -> None:
         self._view = view
         self._problems: list[Problem] = []
+        self._not_kept = 0
         self._stall = ""
         self._noise: dict[str, int] = {}
 
     def problems(self, result: Mapping[str, Any] | None) -> tuple[Problem, ...]:
-        """Return the problems of the run, the first PROBLEMS_MAX; by the host's *result*, what may have ended it is one."""
+        """
+        Return the problems of the run, the first PROBLEMS_MAX and how many more there were.
+
+        By the host's *result*, what may have ended it is one.
+        """
+        problems = list(self._problems)
+        if self._not_kept:
+            were = "was" if self._not_kept == 1 else "were"
+            further = counted(self._not_kept, "further problem")
+            text = f"{further} {were} shown while the run lasted, and not kept"
+            problems.append(Problem(text=text))
         if self._stall and (result is None or result.get("status") in FAILED):
-            return (*self._problems, Problem(text=self._stall))
-        return tuple(self._problems)
+            problems.append(Problem(text=self._stall))
+        return tuple(problems)
 
     def stood_still(self, text: str) -> None:
         """Say that the operator stood still; a run that fails may have failed of that."""
@@ -47,6 +59,8 @@ class Reporter:
         """Say what did not go as it should, and keep it."""
         if len(self._problems) < PROBLEMS_MAX:
             self._problems.append(Problem(text=text, machine=machine))
+        else:
+            self._not_kept += 1
         self._view.say(text, "error")
 
     def show(self, name: str, event: Shown) -> None:

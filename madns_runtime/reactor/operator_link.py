@@ -148,7 +148,7 @@ class OperatorLink:
         self._cut_until_s = math.inf
         self._cut_timer = reactor.call_at(math.inf, self._given_up)
         self._door: AttachSocket | None = None
-        self._silence_timer = reactor.call_at(math.inf, self._lost)
+        self._silence_timer = reactor.call_at(math.inf, self._fallen_silent)
         os.set_blocking(self._read_fd, False)
         os.set_blocking(self._write_fd, False)
         reactor.add_reader(self._read_fd, self._readable)
@@ -210,14 +210,15 @@ class OperatorLink:
     def is_silent(self) -> bool:
         """Whether an operator that sends pings has not done so for a while, though its line stands."""
         is_late = self._reactor.now_s() - self._pinged_s > PING_LATE_S
-        return is_late and not self._is_detached and not self.is_cut
+        is_watched = not self._is_detached and not self.is_cut
+        return is_late and is_watched and not ready([self._read_fd], [], 0)[0]
 
     def flush(self, timeout_s: float) -> bool:
         """
         Write what waits; False if the operator did not take it in time.
 
         One that may come back has told of the last event when this is done; if its line ends meanwhile, it has
-        its time to do so.
+        its time to come back, and then *timeout_s* anew.
         """
         if self._door is not None:
             return self._flush_and_hear(self._door, timeout_s)
@@ -272,6 +273,14 @@ class OperatorLink:
         else:
             self._cut(self._way_back.wait_s)
 
+    def _fallen_silent(self) -> None:
+        """Take an operator for gone whose pings have ceased; those that came while the loop was busy are heard."""
+        pinged_s = self._pinged_s
+        if ready([self._read_fd], [], 0)[0]:
+            self._readable()
+        if not self.is_gone and not self.is_cut and self._pinged_s == pinged_s:
+            self._lost()
+
     def _lost(self) -> None:
         """Take the operator for gone."""
         self._silence_timer.cancel()
@@ -322,6 +331,7 @@ class OperatorLink:
         self._reactor.add_reader(self._read_fd, self._readable)
         self.is_cut = self._is_deaf = self._is_last_call = False
         self._pinged_s = self._reactor.now_s()
+        self._silence_timer.reschedule(self._pinged_s + PING_SILENCE_S)
         self._cut_timer.reschedule(math.inf)
         self._in = b""
         self._out.clear()
@@ -342,12 +352,15 @@ class OperatorLink:
             reading = [door.fileno(), *(() if self.is_cut else (self._read_fd,))]
             writing = [self._write_fd] if self._out and not self.is_cut else []
             readable, writable = ready(reading, writing, left_s)
+            was_cut = self.is_cut
             if writable:
                 self._write()
             if door.fileno() in readable:
                 door.step()
             elif readable:
                 self._readable()
+            if was_cut and not self.is_cut:
+                deadline_s = monotonic() + timeout_s
         return not self._kept
 
     # Commands -------------------------------------------------------------------------------------

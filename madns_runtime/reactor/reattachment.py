@@ -116,7 +116,7 @@ class AttachSocket:
         self._on_attached = on_attached
         self._visitor: socket.socket | None = None
         self._line = b""
-        self._timer = reactor.call_at(float("inf"), self._refuse)
+        self._timer = reactor.call_at(float("inf"), self._overdue)
         self._listener = private_socket.listen(place.directory, self._name, BACKLOG)
         reactor.add_reader(self._listener.fileno(), self._accept)
 
@@ -186,6 +186,12 @@ class AttachSocket:
         self._reactor.remove_reader(visitor.fileno())
         self._reactor.add_reader(self._listener.fileno(), self._accept)
         return visitor
+
+    def _overdue(self) -> None:
+        """Turn away a visitor that says nothing; one whose line came while the loop was busy is heard."""
+        if self._visitor is not None:
+            self._read()
+        self._refuse()
 
     def _refuse(self) -> None:
         if self._visitor is not None:

@@ -271,7 +271,7 @@ class Supervisor:
             )
         if will_restart:
             self._to_fork.append(child.agents)
-            self._restart_soon(child)
+            self._restart_in(max(child.returns_after_s or 0.0, RESTART_DELAY_S), child)
 
     def _may_restart(self, child: SupervisedProcess) -> bool:
         """Tell whether a process that failed is started again: by a fault's own word, or by the scenario's."""
@@ -284,16 +284,14 @@ class Supervisor:
             and child.incarnation - child.killed_before <= self._launch.config.agents.restarts_max
         )
 
-    def _restart_soon(self, child: SupervisedProcess) -> None:
-        due_s = self._reactor.now_s() + max(child.returns_after_s or 0.0, RESTART_DELAY_S)
-        self._reactor.call_at(due_s, partial(self._restart, child))
+    def _restart_in(self, wait_s: float, child: SupervisedProcess) -> None:
+        self._reactor.call_at(self._reactor.now_s() + wait_s, partial(self._restart, child))
 
     def _restart(self, child: SupervisedProcess) -> None:
         if self._is_ending:
             self._reap()
         elif self._operator.is_cut:  # it comes back first, or all is over
-            child.returns_after_s = RESTART_DELAY_S
-            self._restart_soon(child)
+            self._restart_in(RESTART_DELAY_S, child)
         else:
             try:
                 anew = self._fork(child.agents, incarnation=child.incarnation + 1)
@@ -309,8 +307,7 @@ class Supervisor:
             child.reason = why
             text = f"{why}; it is tried again every {RESTART_DELAY_S:g} s"
             self._operator.emit({"event": "log", "level": "warning", "text": text})
-        child.returns_after_s = RESTART_DELAY_S
-        self._restart_soon(child)
+        self._restart_in(RESTART_DELAY_S, child)
 
     def _tell_started(self, child: SupervisedProcess) -> None:
         if child.agents in self._to_fork:

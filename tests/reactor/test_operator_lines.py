@@ -175,6 +175,30 @@ def test_operator_whose_pings_cease_is_gone(reactor, pipes, monkeypatch):
     assert line.is_gone
 
 
+@pytest.mark.parametrize(
+    ("waiting", "is_gone"), [(b'{"command": "ping", "n": 2}\n', False), (b"", True)]
+)
+def test_operator_whose_pings_wait_behind_a_long_call_is_not_gone(reactor, pipes, waiting, is_gone):
+    commands, gone = [], []
+    line = link(reactor, pipes, commands, gone)
+    message = os.pipe()
+
+    def take():
+        os.read(message[0], 1)
+        os.write(pipes[1], waiting)
+        line._silence_timer.reschedule(reactor.now_s())  # it has come while the plug-in was called
+        reactor.call_at(reactor.now_s(), reactor.stop)
+
+    reactor.add_reader(message[0], take)
+    os.write(message[1], b"x")
+
+    reactor.run()
+
+    assert (bool(gone), line.is_gone) == (is_gone, is_gone)
+    for end in message:
+        os.close(end)
+
+
 def test_operator_that_never_pinged_is_not_gone_for_its_silence(reactor, pipes, monkeypatch):
     monkeypatch.setattr(operator_link, "PING_SILENCE_S", 0.05)
     commands, gone = [], []
@@ -239,6 +263,8 @@ def test_operator_is_late_when_its_pings_are(reactor, pipes, monkeypatch):
 
     assert seen[0] is False
     assert seen[-1] is True
+    os.write(pipes[1], b'{"command": "ping", "n": 2}\n')  # and the loop has not come to read it
+    assert line.is_silent is False
 
 
 def test_end_that_comes_a_moment_later_is_waited_for(reactor, pipes):

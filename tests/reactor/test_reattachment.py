@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import pytest
@@ -56,14 +57,21 @@ class Stage:
         self.run_until(lambda: self.link.is_cut or self.link.is_gone)
 
     def visit(self, seen: int = 0, **changes: Any) -> socket.socket:
+        visitor = self.knock()
+        self.introduce(visitor, seen, **changes)
+        return visitor
+
+    def knock(self) -> socket.socket:
         visitor = socket.socket(socket.AF_UNIX)
         self.visitors.append(visitor)
         visitor.settimeout(WAIT_S)
         with socket_address(self.directory, OPERATOR_SOCKET.format(1)) as address:
             visitor.connect(address)
+        return visitor
+
+    def introduce(self, visitor: socket.socket, seen: int = 0, **changes: Any) -> None:
         asked = {"command": "attach", "session": SESSION, "incarnation": 1, "seen": seen, **changes}
         visitor.sendall(json.dumps(asked).encode() + b"\n")
-        return visitor
 
     def run_until(self, condition: Callable[[], Any]) -> None:
         until_s = self.reactor.now_s() + WAIT_S
@@ -200,6 +208,18 @@ def test_operator_that_does_not_come_back_in_time_is_gone(make) -> None:
     assert stage.link.is_gone
 
 
+def test_operator_that_is_back_and_sends_no_pings_is_gone(make, monkeypatch) -> None:
+    monkeypatch.setattr(operator_link, "PING_SILENCE_S", 0.2)
+    stage = make()
+    stage.break_line()
+    stage.visit()
+    stage.run_until(lambda: stage.attached)
+
+    stage.run_until(lambda: stage.gone)
+
+    assert stage.link.is_gone
+
+
 def test_operator_that_means_the_end_of_its_line_is_gone_at_once(make) -> None:
     stage = make()
     os.write(stage.ends[1], b'{"command": "leave"}\n')
@@ -249,6 +269,20 @@ def test_visitor_that_says_nothing_does_not_keep_others_out(make, monkeypatch) -
         stage.run_until(lambda: stage.attached)
 
 
+def test_visitor_whose_line_came_while_the_loop_was_busy_is_let_in(make, monkeypatch) -> None:
+    monkeypatch.setattr(reattachment, "ATTACH_LINE_S", 0.2)
+    stage = make()
+    stage.break_line()
+    visitor = stage.knock()
+    stage.run_until(lambda: stage.link._door.is_visited)
+    stage.introduce(visitor)
+    threading.Event().wait(0.4)  # the plug-in's call
+
+    stage.run_until(lambda: stage.attached or not stage.link._door.is_visited)
+
+    assert stage.attached
+
+
 def test_events_that_do_not_fit_are_dropped_oldest_first_and_counted(make, monkeypatch) -> None:
     monkeypatch.setattr(reattachment, "KEPT_BYTES_MAX", 10_000)
     stage = make()
@@ -281,6 +315,27 @@ def test_last_event_is_told_although_the_line_breaks_at_the_end(make) -> None:
     assert stage.link.flush(WAIT_S)
     operator.join()
     assert flushed == [True]
+
+
+def test_last_event_is_told_to_an_operator_that_is_back_after_the_time_for_it(
+    make, monkeypatch
+) -> None:
+    stage = make(wait_s=10 * WAIT_S)
+    stage.break_line()
+    stage.link.emit({"event": "finished"})
+    visitor = stage.visit()
+    later_s = iter([0.0])
+    monkeypatch.setattr(operator_link, "monotonic", lambda: monotonic() + next(later_s, 2 * WAIT_S))
+
+    def hear() -> None:
+        said(visitor, 2)
+        visitor.sendall(b'{"command": "seen", "seen": 1}\n')
+
+    operator = threading.Thread(target=hear)
+    operator.start()
+
+    assert stage.link.flush(WAIT_S)
+    operator.join()
 
 
 def test_end_does_not_wait_for_ever_for_an_operator_that_does_not_come(make) -> None:

@@ -12,7 +12,7 @@ import pytest
 from madns_runtime.config import Agents
 from madns_runtime.realtime.agent_calls import AgentCalls
 from madns_runtime.realtime.agent_report import AgentOutcome, make_reason_pipe
-from madns_runtime.realtime.supervisor import SupervisedProcess, Supervisor
+from madns_runtime.realtime.supervisor import RESTART_DELAY_S, SupervisedProcess, Supervisor
 
 
 def test_a_reader_that_finds_nothing_after_reaping_does_not_wait():
@@ -84,6 +84,29 @@ def test_a_process_that_cannot_be_started_anew_is_tried_again_and_costs_no_other
     assert told in said[0]["text"]
     assert said[1]["incarnation"] == 2
     assert supervisor._to_fork == []
+
+
+def test_a_process_that_was_to_return_while_the_operator_was_cut_off_does_not_wait_its_time_again(
+    monkeypatch,
+):
+    due = []
+    supervisor = Supervisor.__new__(Supervisor)
+    supervisor._operator = SimpleNamespace(is_cut=True, emit=lambda event: None)
+    supervisor._reactor = SimpleNamespace(now_s=lambda: 5.0, call_at=lambda *call: due.append(call))
+    supervisor._is_ending = False
+    child = SupervisedProcess(
+        ("agent-01",), 1, 1, AgentCalls(), is_killed=True, returns_after_s=9.0
+    )
+    supervisor._to_fork, supervisor._children = [child.agents], {}
+    supervisor._devices = SimpleNamespace(agents_started=lambda *started: None)
+    monkeypatch.setattr(os, "fork", lambda: 77)
+
+    supervisor._restart(child)
+    supervisor._operator.is_cut = False
+    due[-1][1]()
+
+    assert due[-1][0] == pytest.approx(5.0 + RESTART_DELAY_S)
+    assert list(supervisor._children) == [77]
 
 
 @pytest.mark.parametrize(

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import selectors
+import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
 from harness.waiting import wait_until
 
+from cosmos_cli.fleet.connection import StreamEnd
 from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.background import BackgroundTasks
 from cosmos_cli.launch.child import RemoteProgram
 from cosmos_cli.launch.machines import MachinePaths
 from cosmos_cli.launch.remote_child import RemoteChild
-from cosmos_cli.launch.run_events import LineBroke, RunEvent
+from cosmos_cli.launch.run_events import LineBroke, Reattached, RunEvent
 
 pytestmark = pytest.mark.process
 
@@ -112,3 +115,88 @@ def test_program_that_is_gone_behind_a_broken_connection_is_told_as_such(
     wait_for(made, made.child.has_exited)
 
     assert made.child.describe_exit() == "ended as the connection to it broke"
+
+
+class Relay:
+    """A stream whose program says something, and ends well, at once or when its far end is closed."""
+
+    def __init__(self, said: bytes, *, is_ended: bool = True) -> None:
+        self._out, self.far_end = os.pipe()
+        os.set_blocking(self._out, False)
+        os.write(self.far_end, said)
+        if is_ended:
+            os.close(self.far_end)
+
+    def fileno(self) -> int:
+        return self._out
+
+    def read(self, count: int) -> bytes:
+        return os.read(self._out, count)
+
+    def write(self, data: bytes) -> int:
+        return len(data)
+
+    def ending(self, *, timeout_s: float) -> StreamEnd:
+        return StreamEnd(exit_status=0, errors="")
+
+    def close(self) -> None:
+        os.close(self._out)
+
+
+@pytest.mark.parametrize(
+    ("said", "has_exited"), [(b"", False), (b'{"event": "attached", "commands": 0}\n', True)]
+)
+def test_program_that_has_not_greeted_over_a_new_line_is_not_taken_for_ended(
+    started, tmp_path, monkeypatch, said, has_exited
+):
+    """It turns away whoever does not introduce themselves in time, as over a connection that stands still, and lives on."""
+    made = started(str(tmp_path / "runs" / "0001-c"))
+    monkeypatch.setattr(
+        "cosmos_cli.launch.remote_child._fate", lambda stream, machine: (None, False)
+    )
+    wait_for(made, lambda: any(isinstance(event, LineBroke) for event in made.told))
+    made.told.clear()
+    monkeypatch.setattr("cosmos_cli.launch.remote_child._fate", lambda stream, machine: (0, True))
+    monkeypatch.setattr("cosmos_cli.launch.remote_child._reattach", lambda *_: (Relay(said), b""))
+
+    made.child.reattach()
+    wait_for(
+        made,
+        lambda: made.child.has_exited() or any(isinstance(event, LineBroke) for event in made.told),
+    )
+
+    assert made.child.has_exited() == has_exited
+
+
+def test_end_of_a_line_that_another_one_has_replaced_is_none_of_the_program(
+    started, tmp_path, monkeypatch
+):
+    """The program closes the old line for the new one: what became of the old one may be known later than that."""
+    made = started(str(tmp_path / "runs" / "0001-c"))
+    monkeypatch.setattr(
+        "cosmos_cli.launch.remote_child._fate", lambda stream, machine: (None, False)
+    )
+    wait_for(made, lambda: any(isinstance(event, LineBroke) for event in made.told))
+    greeting = b'{"event": "attached", "commands": 0}\n'
+    old, new = Relay(greeting), Relay(greeting, is_ended=False)
+    lines, is_replaced, asked = iter([old, new]), threading.Event(), []
+
+    def fate(stream, machine) -> tuple[int, bool]:
+        asked.append(stream)
+        is_replaced.wait(60.0)
+        return 0, True
+
+    monkeypatch.setattr("cosmos_cli.launch.remote_child._fate", fate)
+    monkeypatch.setattr("cosmos_cli.launch.remote_child._reattach", lambda *_: (next(lines), b""))
+    made.child.reattach()
+    wait_for(made, lambda: asked)
+    made.told.clear()
+    made.child.reattach()
+    wait_for(made, lambda: any(isinstance(event, Reattached) for event in made.told))
+    made.told.clear()
+
+    is_replaced.set()
+    wait_for(made, lambda: not made.background.pending)
+
+    assert (asked, made.child.has_exited(), made.told) == ([old], False, [])
+    os.close(new.far_end)
