@@ -11,6 +11,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +22,8 @@ from madns_runtime.recording.reader import read_stream
 
 SAME_TIME_S: Final = 1.5e-6
 """Times are recorded in whole microseconds."""
+SAME_DUE_S: Final = 2e-4
+"""Times at which values were due are by the clock of the device's process in real time, which agrees with the agent's so far."""
 SAME_AGE_US: Final = 1
 Row = Sequence[Any]
 
@@ -166,22 +169,19 @@ def _in_order(a: Sequence[Row], b: Sequence[Row]) -> list[tuple[Row | None, Row 
 
 def _by_time(a: Sequence[Row], b: Sequence[Row]) -> list[tuple[Row | None, Row | None]]:
     """
-    Pair what was due at the same time, several of one time in their order.
+    Pair what was due at the same time, as far as clocks agree, several of one time in their order.
 
     In their order all that mostly was not: then each tick wrote in its own time.
     """
     pairs: list[tuple[Row | None, Row | None]] = []
-    of_b: dict[int, deque[Row]] = {}
-    for row in b:
-        of_b.setdefault(round(row[0] * 1e5), deque()).append(row)
-    for row in a:
-        key = round(row[0] * 1e5)
-        near = next((each for each in (key, key - 1, key + 1) if of_b.get(each)), None)
-        pairs.append((row, None if near is None else of_b[near].popleft()))
-    if sum(other is not None for _, other in pairs) * 2 < min(len(a), len(b)):
+    left, right = (deque(sorted(rows, key=itemgetter(0))) for rows in (a, b))
+    while left and right:
+        later_s = left[0][0] - right[0][0]
+        row = left.popleft() if later_s <= SAME_DUE_S else None
+        pairs.append((row, right.popleft() if later_s >= -SAME_DUE_S else None))
+    if sum(None not in pair for pair in pairs) * 2 < min(len(a), len(b)):
         return _in_order(a, b)
-    pairs += [(None, row) for rows in of_b.values() for row in rows]
-    return sorted(pairs, key=lambda pair: (pair[0] or pair[1] or (0.0,))[0])
+    return [*pairs, *((row, None) for row in left), *((None, row) for row in right)]
 
 
 def _is_same_input(a: Any, b: Any) -> bool:

@@ -133,30 +133,3 @@ def test_what_ended_a_process_is_told_as_nobodys_in_particular(agents, who, told
     assert (child.reason, child.may_restart) == (told, True)
     os.close(supervisor._reason_read_fd)
     os.close(supervisor._reason_write_fd)
-
-
-def test_one_whose_return_meets_a_cut_line_is_back_as_soon_as_the_operator_is(monkeypatch):
-    now_s, due, forks = [100.0], [], []
-    supervisor = Supervisor.__new__(Supervisor)
-    supervisor._operator = SimpleNamespace(is_cut=True)
-    supervisor._reactor = SimpleNamespace(
-        now_s=lambda: now_s[0], call_at=lambda *call: due.append(call)
-    )
-    supervisor._is_ending = False
-
-    def fork(agents, *, incarnation):
-        forks.append(now_s[0])
-        return SupervisedProcess(agents, 8, incarnation, AgentCalls())
-
-    monkeypatch.setattr(supervisor, "_fork", fork)
-    monkeypatch.setattr(supervisor, "_tell_started", lambda child: None)
-    child = SupervisedProcess(("agent-01",), 7, 1, AgentCalls(), is_killed=True)
-    child.returns_after_s = 60.0
-    supervisor._restart_soon(child)
-
-    while due and not forks:
-        now_s[0], call = due.pop()
-        supervisor._operator.is_cut = now_s[0] < 161.0
-        call()
-
-    assert forks == [pytest.approx(161.0, abs=0.21)]

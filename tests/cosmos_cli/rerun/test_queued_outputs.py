@@ -169,3 +169,14 @@ def test_values_of_real_time_that_differ_by_microseconds_find_those_of_their_tic
     rerun = [(0.1, 1.0), (0.1, 2.0), (0.2, 1.0), (0.2, 2.0)]
 
     assert compared(tmp_path, recorded, rerun).different == 0
+
+
+def test_what_another_clock_put_out_a_moment_off_its_time_finds_that_of_its_time(tmp_path):
+    times_s = [0.05 * number for number in range(1, 18)]
+    recorded = [(t_s + 41e-6 * (-1) ** k, float(k)) for k, t_s in enumerate(times_s)]
+    rerun = [(t_s, float(k)) for k, t_s in enumerate(times_s)]
+
+    assert compared(tmp_path / "whole", recorded, rerun).different == 0
+    missing = compared(tmp_path / "missing", [*recorded[:8], *recorded[9:]], rerun)
+    assert (missing.compared, missing.different) == (17, 1)
+    assert missing.first.text == "only in the rerun"
