@@ -239,15 +239,14 @@ def _add_positions(
 
 def _slots_of(a: ComparedRun, b: ComparedRun) -> tuple[Slots, Slots]:
     """Return both runs' slots over time, at times that both have, and that the longer one has alone."""
-    tables = a.run.tables, b.run.tables
-    of_a, of_b = (np.round(recorded_times_s(one), TIME_DECIMALS) for one in tables)
+    of_a, of_b = (np.round(recorded_times_s(one.run.tables), TIME_DECIMALS) for one in (a, b))
     both_s = np.intersect1d(of_a, of_b)
     later_s = max(of_a, of_b, key=lambda times_s: times_s[-1:].tolist())
     times_s = np.concatenate((both_s, later_s[later_s > both_s.max(initial=-np.inf)]))
     times_s = times_s[evenly(len(times_s), TIMES_MAX)]
     slots_a, slots_b = (
-        read_control(one, side.run.config, times_s[times_s <= own_s.max(initial=-np.inf)])
-        for one, side, own_s in zip(tables, (a, b), (of_a, of_b), strict=True)
+        read_control(one.run.tables, one.run.config, times_s[times_s <= own_s.max(initial=-np.inf)])
+        for one, own_s in zip((a, b), (of_a, of_b), strict=True)
     )
     return slots_a, slots_b
 
