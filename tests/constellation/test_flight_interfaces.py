@@ -23,7 +23,10 @@ from madns_runtime.plugin import isolation
 from madns_runtime.plugin.device_view import ChannelFrame
 from madns_runtime.simulations.constellation.flight.asked_ticks import UNANSWERED_MAX
 from madns_runtime.simulations.constellation.flight.interface.program import FlightProgram
-from madns_runtime.simulations.constellation.flight.interface.socket_transports import resolve_both
+from madns_runtime.simulations.constellation.flight.interface.socket_transports import (
+    SocketLink,
+    resolve_both,
+)
 from madns_runtime.simulations.constellation.flight.process import ExternalFlight
 
 pytestmark = pytest.mark.process
@@ -722,6 +725,33 @@ def test_a_socket_that_somebody_listens_at_is_left_to_him_and_one_left_behind_gi
     with Attached(tmp_path, None, flight=attached(transport)):
         assert (tmp_path / "a.sock").is_socket()
     assert not (tmp_path / "a.sock").exists()
+
+
+class BoundToItsGoal(socket.socket):
+    """A socket to which the kernel gives the port that it connects to, as it may where nobody listens there."""
+
+    def connect_ex(self, place):
+        self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.bind(place)
+        return super().connect_ex(place)
+
+
+def test_an_agent_does_not_take_its_own_end_of_a_connection_for_software(monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as one:
+        place = one.getsockname()
+    link = SocketLink("tcp", socket.AF_INET, place, listens=False)
+    link.open()
+    with monkeypatch.context() as patched:
+        patched.setattr(socket, "socket", BoundToItsGoal)
+        link.push()  # begins to connect
+    link.push()
+    assert not link.is_ready
+
+    with socket.create_server(place) as software:  # whose port is free
+        wait_until(lambda: link.push() or link.is_ready, "a connection to the software")
+        software.settimeout(PATIENCE_S)
+        software.accept()[0].close()
+    link.close()
 
 
 @pytest.mark.parametrize(

@@ -418,6 +418,8 @@ def body(*lines):
         ("[self.context.broadcast(1) for _ in range(65)]", "at most 64 messages"),
         ("self.context.broadcast(object())", "send: "),
         ("self.context.send(3, 1)", "expected a receiver's name, got 3"),
+        ("self.context.send('x' * 20_000, 'agent-02')", "a name of at most 16384 bytes, got 20"),
+        ("self.context.send('agent-' + chr(0xD800), 1)", "send: "),
         ("self.context.estimate({})", "a mapping of 1 to 64 names"),
         ("self.context.estimate({'a': 1}); self.context.estimate({'b': 1})", "numbers for a,"),
         ("self.context.estimate({'a': 'x'})", "numbers for a,"),

@@ -32,14 +32,14 @@ RIGID = Vehicle(
 )
 
 
-def desk(vehicle=PLAIN, *, can_maneuver=True, **settings):
+def desk(vehicle=PLAIN, *, can_maneuver=True, knot_s=1.0, **settings):
     settings = Maneuvers(propagation_s=0.02, network_s=0.03, **settings)
     rules = Rules(
         settings=settings,
         can_maneuver=can_maneuver,
         duration_s=100.0,
         tick_hz=10.0,
-        knot_s=1.0,
+        knot_s=knot_s,
         seed=5,
     )
     return ManeuverDesk(rules, ["a"], [vehicle], [Timeline(vehicle.ballistic_m2_kg)])
@@ -129,6 +129,19 @@ def test_what_cannot_be_done_is_refused_and_says_why(wrong, reason):
     assert reason in taken.reason
     assert at._timelines[0].effects == ()
     assert (at.account.commanded, at.account.refused) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("at_s", "status", "reason"),
+    [(1.7e308, "refused", "beyond the run"), (-1.7e308, "postponed", "too late")],
+)
+def test_a_time_too_large_to_have_a_knot_is_judged_as_any_other(at_s, status, reason):
+    dense = desk(knot_s=0.1)
+
+    taken = dense.decide(0, command(at_s), 10.0)
+
+    assert taken.status == status
+    assert reason in taken.reason
 
 
 def test_vehicles_without_the_actuator_are_told_so():

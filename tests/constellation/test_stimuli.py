@@ -28,10 +28,14 @@ from madns_runtime.simulations.constellation.orbit.earth import (
 from madns_runtime.simulations.constellation.orbit.quaternions import multiply, normalised, rotate
 from madns_runtime.simulations.constellation.orbit.sun import sun_m
 from madns_runtime.simulations.constellation.stimulus import SOURCES, Stimulus
+from madns_runtime.simulations.constellation.vehicle.future_truth import FutureTruth
 from madns_runtime.simulations.constellation.vehicle.sensors.environment import Scene
 from madns_runtime.simulations.constellation.vehicle.sensors.instruments import FluxGate
 from madns_runtime.simulations.constellation.vehicle.stimuli import Stimuli, earth_fixed_state
-from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
+from madns_runtime.simulations.constellation.vehicle.truth_buffer import (
+    SEGMENTS_MAX,
+    TruthBuffer,
+)
 
 EPOCH = "2026-03-20T12:00:00Z"
 LEO = (7.158e6, 0.0, 0.0, 0.0, 1000.0, 7390.0)
@@ -172,6 +176,30 @@ def test_a_revision_that_comes_late_gives_the_value_that_holds_now_and_no_older_
     assert [t for t in device.points if t >= 1.0][0] == 2.0
     assert device.points[2.0][0] == LEO[0] + 1000.0
     assert stimuli.finish(9.0)["coil.field"]["omitted"] == 10
+
+
+def test_a_vehicle_that_is_commanded_at_every_tick_is_given_its_newest_truth():
+    stimuli, device = play(segment(0.0, knots=41), source="position", rate_hz=10.0, lead_s=1.0)
+
+    for k in range(200):
+        stimuli.take(segment(0.1 * k + 0.2, knots=31, revision=k + 1, x_m=k + 1.0), 0.1 * k)
+        stimuli.step(0.1 * k)
+
+    # From 20.1 s on the last revision; a tenth of a second of each before it.
+    assert device.points[20.5][0] == pytest.approx(LEO[0] + 200.0)
+    assert device.points[15.0][0] == pytest.approx(LEO[0] + 149.0)
+    assert stimuli.finish(20.0)["coil.field"]["segments_refused"] == 0
+
+
+def test_truth_that_a_newer_revision_has_replaced_takes_no_room_when_it_comes_late():
+    truth = FutureTruth()
+    assert truth.add(segment(5.0, revision=2, x_m=2.0))
+
+    assert not any(truth.add(segment(5.0, revision=1, x_m=1.0)) for _ in range(2 * SEGMENTS_MAX))
+    assert truth.add(segment(0.0, revision=1, x_m=1.0))
+
+    assert truth.refused == 0
+    assert [truth.lookup(t_s)[0] - LEO[0] for t_s in (4.9, 5.0, 9.9)] == [1.0, 2.0, 2.0]
 
 
 def scene_at(state, t_s=0.0):

@@ -36,7 +36,7 @@ from madns_runtime.simulations.constellation.vehicle.commands import (
 from madns_runtime.simulations.constellation.vehicles import flight_of
 
 PAYLOAD_BYTES_MAX = 16_384
-"""Of one message by radio, encoded."""
+"""Of one message by radio, encoded, and of its receiver's name."""
 MESSAGES_PER_TICK_MAX = 64
 REFUSALS_MAX = 1024
 """Number of refusals that wait for the next tick to be told; older ones are dropped, but counted as all others."""
@@ -132,7 +132,11 @@ class VehicleContext:
                 f"send: expected at most {MESSAGES_PER_TICK_MAX} messages in one tick; "
                 f"the tick at {self._t_s:g} s wants more"
             )
-        size = _payload_bytes(payload)
+        if (to_bytes := _encoded_bytes(to)) > PAYLOAD_BYTES_MAX:
+            raise PluginError(
+                f"send: expected as its receiver a name of at most {PAYLOAD_BYTES_MAX} bytes, got {to_bytes}: {to!r:.80}"
+            )
+        size = _encoded_bytes(payload)
         number = self._first_message + self._messages
         self._messages += 1
         self._messages_in_tick += 1
@@ -234,8 +238,14 @@ class VehicleContext:
         return names
 
 
-def _payload_bytes(payload: Any) -> int:
+def _encoded_bytes(part: Any) -> int:
+    """
+    Return how many bytes a part of a message has on its way.
+
+    Raises:
+        PluginError: No message carries it.
+    """
     try:
-        return len(pack(payload))
+        return len(pack(part))
     except MadnsError as error:
         raise PluginError(f"send: {error}") from error

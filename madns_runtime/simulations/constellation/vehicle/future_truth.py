@@ -1,7 +1,8 @@
 """
 A vehicle's truth ahead of its tick, at any time from now on: what a `TruthBuffer`, which forgets what it has passed, cannot give.
 
-Pure, bounded. Each segment is kept whole until it is past; of a time the newest revision that has begun by then counts.
+Pure, bounded. Each segment is kept until it is past or a newer revision has replaced it; of a time the newest revision that
+has begun by then counts.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ class _Stretch:
     revision: int
     t0_s: float
     end_s: float
+    """Until when it holds: its last knot, or sooner if a newer revision begins before."""
     knots: int
     truth: TruthBuffer
 
@@ -48,19 +50,28 @@ class FutureTruth:
         return max((each.end_s for each in self._stretches), default=-math.inf)
 
     def add(self, segment: Segment) -> bool:
-        """Take a segment; False if it was refused."""
-        held = sum(each.knots for each in self._stretches)
-        knots = len(segment.states)
-        if len(self._stretches) >= SEGMENTS_MAX or held + knots > KNOTS_HELD_MAX:
+        """Take a segment; False if it was refused, or a newer revision has replaced all of it."""
+        revision, knots = segment.revision, len(segment.states)
+        newer_s = min((at_s for n, at_s in self._starts.items() if n > revision), default=math.inf)
+        if newer_s <= segment.t0_s:
+            return False
+        start_s = min(self._starts.get(revision, math.inf), segment.t0_s)
+        # Of a vehicle that is commanded at every tick, each future lies as far ahead as the one that replaces it.
+        kept = [
+            each for each in self._stretches if each.revision >= revision or each.t0_s < start_s
+        ]
+        held = sum(each.knots for each in kept)
+        if len(kept) >= SEGMENTS_MAX or held + knots > KNOTS_HELD_MAX:
             self.refused += 1
             return False
+        for each in kept:
+            if each.revision < revision:
+                each.end_s = min(each.end_s, start_s)
         truth = TruthBuffer()
         truth.add(segment)
-        self._stretches.append(
-            _Stretch(segment.revision, segment.t0_s, segment.end_s, knots, truth)
-        )
-        first_s = self._starts.get(segment.revision, math.inf)
-        self._starts[segment.revision] = min(first_s, segment.t0_s)
+        end_s = min(segment.end_s, newer_s)
+        self._stretches = [*kept, _Stretch(revision, segment.t0_s, end_s, knots, truth)]
+        self._starts[revision] = start_s
         self._in_use = None
         return True
 

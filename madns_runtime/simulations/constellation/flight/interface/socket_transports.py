@@ -127,9 +127,16 @@ class SocketLink(StreamTransport):
                 raise BlamedError(f"{self.name}: cannot be reached: {error}") from error
         else:
             code = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-        if code == 0 and _has_peer(self._socket):
+        peer = _peer_of(self._socket) if code == 0 else None
+        # Where nobody listens, the kernel may connect a port of its choice with itself, and so keep the software from it.
+        is_itself = peer is not None and peer == self._socket.getsockname()
+        if peer is not None and not is_itself:
             self._begin(self._socket)
-        elif code not in (0, errno.EINPROGRESS) or monotonic() - self._tried_s > CONNECT_S:
+        elif (
+            is_itself
+            or code not in (0, errno.EINPROGRESS)
+            or monotonic() - self._tried_s > CONNECT_S
+        ):
             self._socket.close()
             self._socket = None
 
@@ -316,12 +323,12 @@ def _resolved(address: str, kind: int, where: str) -> list[tuple[int, Any]]:
     return [(int(family), place) for family, _, _, _, place in found]
 
 
-def _has_peer(one: socket.socket) -> bool:
+def _peer_of(one: socket.socket) -> Any:
+    """Return the address at the other end of a connection; None if there is none yet."""
     try:
-        one.getpeername()
+        return one.getpeername()
     except OSError:
-        return False
-    return True
+        return None
 
 
 def _remove_socket(path: str, name: str) -> None:

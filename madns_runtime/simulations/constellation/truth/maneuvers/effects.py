@@ -222,8 +222,11 @@ def spin_rad_s_max(knot_s: float) -> float:
 
 
 def snap(t_s: float, knot_s: float) -> float:
-    """Return *t_s*, or the grid knot that it means."""
-    knot = round(t_s / knot_s) * knot_s
+    """Return *t_s*, or the grid knot that it means; a time so large that it has no knot's number stays."""
+    number = t_s / knot_s
+    if not math.isfinite(number):
+        return t_s
+    knot = round(number) * knot_s
     return knot if abs(knot - t_s) <= SNAP_S else t_s
 
 
