@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from cryptography.exceptions import UnsupportedAlgorithm
 from paramiko.agent import AgentKey, AgentSSH
 from paramiko.message import Message
 from paramiko.pkey import PKey, UnknownKeyType
@@ -138,6 +139,8 @@ def _of_files(settings: SshSettings, notes: list[str]) -> Iterator[tuple[str, PK
             note = f"{file}: {error.strerror or error}"
         except PasswordRequiredException:
             note = f"{file} needs its passphrase: ssh-add it"
+        except UnsupportedAlgorithm as error:
+            note = f"{file} cannot be read ({error}): ssh-add it"
         except (SSHException, UnknownKeyType, ValueError) as error:
             note = f"{file}: not a private key that is understood ({error})"
         held = _held_by_agent(settings, file)
@@ -167,6 +170,7 @@ def load_key(file: str) -> PKey:
         PasswordRequiredException: It needs a passphrase.
         SSHException: It is no key.
         UnknownKeyType: It is one of a kind that paramiko does not know.
+        UnsupportedAlgorithm: Its other half is on a security token, or its cipher is not known.
     """
     with _LOADING:
         return _load_key(file)

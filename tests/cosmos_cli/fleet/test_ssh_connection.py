@@ -186,6 +186,22 @@ def test_file_that_is_no_key_is_named(known, known_hosts):
     assert "not a private key that is understood" in caught.value.text
 
 
+def test_key_of_an_unknown_cipher_is_named_and_others_are_tried(known, tmp_path, home):
+    key = tmp_path / "other_cipher"
+    cipher = ("-Z", "chacha20-poly1305@openssh.com")
+    subprocess.run(["ssh-keygen", "-q", "-N", "secret", *cipher, "-f", key], check=True)
+    shutil.copy(known.user_key, tmp_path / "good")
+    identities = [f"  IdentityFile {name}" for name in (key, tmp_path / "good")]
+    write_configuration(home / ".ssh" / "config", "Host *", *identities)
+
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=str(key)))
+
+    assert f"{key} cannot be read (Unsupported cipher: " in caught.value.text
+    assert "ssh-add it" in caught.value.text
+    assert says(target_of(known, key_file=None)) == b"hello\n"
+
+
 def test_without_any_key_it_is_said_how_to_get_one(known):
     with failing(FailureKind.AUTHENTICATION) as caught:
         connect(target_of(known, key_file=None))
