@@ -434,8 +434,8 @@ def test_what_is_no_name_is_told(known):
 
 
 @contextlib.contextmanager
-def speaking_server(answer: bytes):
-    """A server that says something and closes."""
+def speaking_server(answer: bytes, *, stays: bool = False):
+    """A server that says something and closes, or hears the other side out before."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve():
@@ -444,6 +444,8 @@ def speaking_server(answer: bytes):
                     connection, _ = listener.accept()
                     with connection:
                         connection.sendall(answer)
+                        while stays and connection.recv(4096):
+                            pass
 
         thread = threading.Thread(target=serve, daemon=True)
         thread.start()
@@ -470,6 +472,21 @@ def test_server_of_another_protocol_is_told(known):
         connect(target_of(known, port=port), DEFAULT)
 
     assert "Indecipherable protocol version" in caught.value.text
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        b"\0\0\0\x0c\xc8" + b"x" * 200,  # more padding than packet
+        b"\0\0\0\x14\x04\x01\0\0\0\x02\0\0\0\x02\xff\xfe" + b"x" * 8,  # no text
+    ],
+)
+def test_server_that_speaks_a_broken_ssh_is_no_defect(known, packet):
+    server = speaking_server(b"SSH-2.0-test\r\n" + packet, stays=True)
+    with server as port, failing(FailureKind.LOST) as caught:
+        connect(target_of(known, port=port), DEFAULT)
+
+    assert "what it said is not understood: " in caught.value.text
 
 
 def test_server_that_names_itself_and_says_nothing_more_is_frozen(known):
