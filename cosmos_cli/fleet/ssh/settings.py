@@ -88,7 +88,8 @@ def settings_of(target: Target) -> SshSettings:
     port = target.port or _number(value("port", str(SSH_PORT)), "Port")
     named = [target.key_file] if target.key_file else list(found.get("identityfile", ()))
     named = [name for name in named if name.lower() != "none"]
-    jump, command = value("proxyjump", "none"), value("proxycommand", "none")
+    command = value("proxycommand", "none")
+    jump = "none" if _is_command_first(found) else value("proxyjump", "none")
     is_direct = jump.lower() == "none"
     timeout = value("connecttimeout", "none")
     return SshSettings(
@@ -110,6 +111,12 @@ def settings_of(target: Target) -> SshSettings:
         proxy_command=command if is_direct and command.lower() != "none" else None,
         connect_timeout_s=_timeout_s(timeout),
     )
+
+
+def _is_command_first(found: Values) -> bool:
+    """Tell whether a ProxyCommand, were it none, stands before every ProxyJump: as with ssh, the first of both counts."""
+    ways = [keyword for keyword in found if keyword in ("proxyjump", "proxycommand")]
+    return ways[:1] == ["proxycommand"]
 
 
 def _timeout_s(text: str) -> int | None:

@@ -114,6 +114,22 @@ def test_jump_that_is_none_and_command_that_is_none_are_no_proxies(configure):
 
 
 def test_jump_that_is_not_understood_is_told(configure):
+@pytest.mark.parametrize(
+    ("lines", "jumps", "command"),
+    [
+        (["ProxyCommand none", "ProxyJump gate"], [], None),
+        (["ProxyCommand nc gate", "ProxyJump gate"], [], "nc gate"),
+        (["ProxyJump gate", "ProxyCommand nc gate"], ["gate"], None),
+        (["ProxyJump none", "ProxyCommand nc gate"], [], "nc gate"),
+    ],
+)  # as `ssh -G` has it
+def test_of_jump_and_command_the_first_counts(configure, lines, jumps, command):
+    configure(*lines)
+
+    assert [jump.address for jump in settings().jumps] == jumps
+    assert settings().proxy_command == command
+
+
     configure("ProxyJump pi@")
 
     with pytest.raises(InputError, match="ProxyJump of pi: expected"):
