@@ -166,9 +166,11 @@ def _jumps(name: str, value: str) -> tuple[Target, ...]:
     return tuple(jumps)
 
 
-def _files(*lists: str) -> tuple[Path, ...]:
-    names = [name for text in lists for name in shlex.split(text)]
-    return tuple(_path(name) for name in names if name.lower() != "none")
+def _files(own: str, everybodys: str) -> tuple[Path, ...]:
+    """Return the known_hosts files; own ones that are none stay as a place where nothing is recorded."""
+    names = [os.devnull if name.lower() == "none" else name for name in shlex.split(own)]
+    names += [name for name in shlex.split(everybodys) if name.lower() != "none"]
+    return tuple(_path(name) for name in names)
 
 
 def _path(name: str) -> Path:

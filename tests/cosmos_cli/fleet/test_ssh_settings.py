@@ -8,6 +8,7 @@ import pytest
 from ssh_harness import write_configuration
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.fleet.ssh.known_hosts import HostKey, KnownHosts
 from cosmos_cli.fleet.ssh.settings import settings_of
 from cosmos_cli.fleet.target import Target
 
@@ -113,7 +114,6 @@ def test_jump_that_is_none_and_command_that_is_none_are_no_proxies(configure):
     assert (settings().jumps, settings().proxy_command) == ((), None)
 
 
-def test_jump_that_is_not_understood_is_told(configure):
 @pytest.mark.parametrize(
     ("lines", "jumps", "command"),
     [
@@ -130,6 +130,7 @@ def test_of_jump_and_command_the_first_counts(configure, lines, jumps, command):
     assert settings().proxy_command == command
 
 
+def test_jump_that_is_not_understood_is_told(configure):
     configure("ProxyJump pi@")
 
     with pytest.raises(InputError, match="ProxyJump of pi: expected"):
@@ -161,6 +162,19 @@ def test_several_known_hosts_files_are_read_in_their_order(home):
     )
 
     assert settings().known_hosts == (home / "a", Path("/with space/b"))
+
+
+def test_own_known_hosts_that_are_none_leave_everybodys_as_it_is(home, tmp_path):
+    everybodys = tmp_path / "ssh_known_hosts"
+    (home / ".ssh" / "config").write_text(
+        f"UserKnownHostsFile none\nGlobalKnownHostsFile {everybodys}\n"
+    )
+    known = KnownHosts(settings().known_hosts)
+
+    known.record("pi", HostKey(kind="ssh-ed25519", blob=b"a"))
+
+    assert everybodys in settings().known_hosts
+    assert not everybodys.exists()
 
 
 def test_home_of_nobody_leads_nowhere(configure):
