@@ -308,6 +308,19 @@ def test_key_with_a_passphrase_is_used_through_the_agent(known, agent, tmp_path,
     assert says(target_of(known, key_file=str(key))) == b"hello\n"
 
 
+def test_key_with_which_the_agent_does_not_sign_leaves_the_others(known, agent, home, tmp_path):
+    refused = make_key(tmp_path / "refused", "ed25519")
+    nobody = {"SSH_ASKPASS": "/bin/false", "SSH_ASKPASS_REQUIRE": "force"}
+    subprocess.run(["ssh-add", "-q", "-c", refused], check=True, env={**os.environ, **nobody})
+
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=None))
+    shutil.copy(known.user_key, home / ".ssh" / "id_ed25519")
+
+    assert "the ssh agent does not sign with " in caught.value.text
+    assert says(target_of(known, key_file=None)) == b"hello\n"
+
+
 def test_public_key_as_identity_names_one_that_the_agent_holds(known, agent, tmp_path):
     agent(make_key(tmp_path / "other", "ed25519"))
     agent(known.user_key)
