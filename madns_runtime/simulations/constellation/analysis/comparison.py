@@ -191,9 +191,8 @@ def _compare_positions(
             _add_positions(difference, piece, names, spread)
         if difference.count:
             found[agent] = difference
-    if (
-        spread.rows()
-    ):  # satellites that were in the same places count over time, too, where there are others
+    # Satellites that were in the same places count over time, too, where there are others.
+    if spread.rows():
         _add_same_places(same, _tick_hz(a), spread)
     return found, spread.rows()
 
