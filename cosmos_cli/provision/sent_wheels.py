@@ -31,6 +31,7 @@ import tempfile
 import threading
 import warnings
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,6 +61,11 @@ UNCHECKED_HASH = 1
 LOCK = "sent.lock"
 LOCK_TIMEOUT_S = 900.0
 """A slow operator compiles numpy for some minutes, once."""
+FAULTS = (
+    *(zipfile.BadZipFile, zlib.error, csv.Error, EOFError, LookupError),
+    *(NotImplementedError, RuntimeError, ValueError),
+)
+"""Errors of reading a wheel that is damaged, or not what the specification asks for."""
 _compiling = threading.Lock()
 """The filters of warnings are the process's: two threads that set and restore them leave those of one behind."""
 
@@ -131,7 +137,7 @@ def _make(path: Path, locked: Locked, folder: Path, platform: Platform) -> Locke
     try:
         with zipfile.ZipFile(path) as source, zipfile.ZipFile(content, "w") as sent:
             _rewrite(source, sent, locked, can_compile=_writes_for(platform))
-    except (zipfile.BadZipFile, KeyError, ValueError, NotImplementedError, RuntimeError):
+    except FAULTS:
         return None
     whole = content.getvalue()
     made = replace(locked, sha256=hashlib.sha256(whole).hexdigest(), size_bytes=len(whole))

@@ -20,11 +20,14 @@ import shutil
 import subprocess
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from email.parser import HeaderParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
+
+from packaging.requirements import Requirement
 
 from cosmos_cli.cache import CACHE_VARIABLE, cache_folder
 from cosmos_cli.errors import InputError
@@ -321,10 +324,24 @@ def _keep_own(path: Path, text: str) -> Path:
     if not kept.is_file() or kept.stat().st_size != len(content):
         if not zipfile.is_zipfile(path):
             raise InputError(f"requirements: {text}: expected a wheel, got another kind of file")
+        _check_metadata(path, text)
         with _own_failures(text):
             kept.parent.mkdir(parents=True, exist_ok=True)
             write_whole(kept, content)
     return kept
+
+
+def _check_metadata(path: Path, text: str) -> None:
+    """Refuse a wheel of which nobody could say what it needs, before any machine is worked on."""
+    try:
+        for requirement in requirements_of(path):
+            Requirement(requirement)
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise InputError(
+            f"requirements: {text}: what it needs cannot be read of its METADATA ({reason});"
+            " build the wheel anew"
+        ) from error
 
 
 @contextlib.contextmanager

@@ -118,6 +118,8 @@ class SshConfig:
         )
         self._pass(query)
         if query.wants_final:
+            # As in ssh: where the host is, is settled by now, and is what Host means from here on.
+            query.found.setdefault("hostname", [host])
             query.is_final = True
             self._pass(query)
         tokens = _tokens(query)
@@ -150,7 +152,7 @@ def _take(line: Line, query: _Query) -> None:
 def _applies(line: Line, query: _Query) -> bool:
     words = _split(line)
     if line.keyword == "host":
-        return matches(words, query.host)
+        return matches(words, (query.is_final and query.first("hostname")) or query.host)
     is_match = True
     while words:
         criterion = words.pop(0).lower()

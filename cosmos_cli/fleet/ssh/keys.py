@@ -19,7 +19,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from paramiko.agent import AgentKey, AgentSSH
+from cryptography.exceptions import UnsupportedAlgorithm
+from paramiko.agent import (
+    SSH2_AGENT_SIGN_RESPONSE,
+    AgentKey,
+    AgentSSH,
+    cSSH2_AGENTC_SIGN_REQUEST,
+)
 from paramiko.message import Message
 from paramiko.pkey import PKey, UnknownKeyType
 from paramiko.ssh_exception import (
@@ -29,6 +35,7 @@ from paramiko.ssh_exception import (
     SSHException,
 )
 from paramiko.transport import Transport
+from paramiko.util import asbytes
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.ssh.failures import login_failure
@@ -84,6 +91,8 @@ class FewKeys:
             except AuthenticationException as error:
                 if not transport.is_active() or "timeout" in str(error):
                     raise
+                if _is_unsigned(key):
+                    notes.append(f"the ssh agent does not sign with {label}")
                 continue
             if further:
                 raise MachineFailure(
@@ -138,6 +147,8 @@ def _of_files(settings: SshSettings, notes: list[str]) -> Iterator[tuple[str, PK
             note = f"{file}: {error.strerror or error}"
         except PasswordRequiredException:
             note = f"{file} needs its passphrase: ssh-add it"
+        except UnsupportedAlgorithm as error:
+            note = f"{file} cannot be read ({error}): ssh-add it"
         except (SSHException, UnknownKeyType, ValueError) as error:
             note = f"{file}: not a private key that is understood ({error})"
         held = _held_by_agent(settings, file)
@@ -167,6 +178,7 @@ def load_key(file: str) -> PKey:
         PasswordRequiredException: It needs a passphrase.
         SSHException: It is no key.
         UnknownKeyType: It is one of a kind that paramiko does not know.
+        UnsupportedAlgorithm: Its other half is on a security token, or its cipher is not known.
     """
     with _LOADING:
         return _load_key(file)
@@ -209,6 +221,8 @@ class _Agent(AgentSSH):
 
     def __init__(self, path: str) -> None:
         super().__init__()
+        self.refused: set[bytes] = set()
+        """Public keys with which it did not sign when it was asked last, such as one that nobody confirmed."""
         self._asking = threading.Lock()
         pipe = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         pipe.settimeout(AGENT_TIMEOUT_S)
@@ -221,7 +235,27 @@ class _Agent(AgentSSH):
 
     def _send_message(self, message: Any) -> Any:
         with self._asking:
-            return super()._send_message(message)  # type: ignore[misc]  # private, in no stub
+            kind, reply = super()._send_message(message)  # type: ignore[misc]  # private, in no stub
+        sent: Any = asbytes(message)
+        asked = Message(sent)
+        if asked.get_byte() != cSSH2_AGENTC_SIGN_REQUEST:
+            return kind, reply
+        key = asked.get_binary()
+        if kind == SSH2_AGENT_SIGN_RESPONSE:
+            self.refused.discard(key)
+            return kind, reply
+        # Without a signature the machine takes another key; paramiko would end the connection.
+        self.refused.add(key)
+        return SSH2_AGENT_SIGN_RESPONSE, Message(Message().add_string(b"").asbytes())
+
+
+def _is_unsigned(key: PKey) -> bool:
+    """Tell whether a key is one of the ssh agent's with which it did not sign."""
+    return (
+        isinstance(key, AgentKey)
+        and isinstance(key.agent, _Agent)
+        and key.blob in key.agent.refused
+    )
 
 
 def agent_keys(path: str | None) -> tuple[AgentKey, ...]:

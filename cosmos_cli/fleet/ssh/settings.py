@@ -88,7 +88,8 @@ def settings_of(target: Target) -> SshSettings:
     port = target.port or _number(value("port", str(SSH_PORT)), "Port")
     named = [target.key_file] if target.key_file else list(found.get("identityfile", ()))
     named = [name for name in named if name.lower() != "none"]
-    jump, command = value("proxyjump", "none"), value("proxycommand", "none")
+    command = value("proxycommand", "none")
+    jump = "none" if _is_command_first(found) else value("proxyjump", "none")
     is_direct = jump.lower() == "none"
     timeout = value("connecttimeout", "none")
     return SshSettings(
@@ -110,6 +111,12 @@ def settings_of(target: Target) -> SshSettings:
         proxy_command=command if is_direct and command.lower() != "none" else None,
         connect_timeout_s=_timeout_s(timeout),
     )
+
+
+def _is_command_first(found: Values) -> bool:
+    """Tell whether a ProxyCommand, were it none, stands before every ProxyJump: as with ssh, the first of both counts."""
+    ways = [keyword for keyword in found if keyword in ("proxyjump", "proxycommand")]
+    return ways[:1] == ["proxycommand"]
 
 
 def _timeout_s(text: str) -> int | None:
@@ -159,9 +166,11 @@ def _jumps(name: str, value: str) -> tuple[Target, ...]:
     return tuple(jumps)
 
 
-def _files(*lists: str) -> tuple[Path, ...]:
-    names = [name for text in lists for name in shlex.split(text)]
-    return tuple(_path(name) for name in names if name.lower() != "none")
+def _files(own: str, everybodys: str) -> tuple[Path, ...]:
+    """Return the known_hosts files; own ones that are none stay as a place where nothing is recorded."""
+    names = [os.devnull if name.lower() == "none" else name for name in shlex.split(own)]
+    names += [name for name in shlex.split(everybodys) if name.lower() != "none"]
+    return tuple(_path(name) for name in names)
 
 
 def _path(name: str) -> Path:

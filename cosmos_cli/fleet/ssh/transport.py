@@ -104,6 +104,15 @@ class SshTransport(Transport):
         keys = super().preferred_keys
         return tuple(sorted(keys, key=lambda name: self.is_certified and CERTIFICATE not in name))
 
+    def get_exception(self) -> Exception | None:
+        """Return what ended the connection: whatever the machine's bytes raised while they were read is SSH's fault."""
+        error = super().get_exception()
+        if error is None or isinstance(error, (SSHException, OSError, EOFError)):
+            return error
+        foreign = SSHException(f"what it said is not understood: {error}")
+        foreign.__cause__ = error
+        return foreign
+
     def begin(self, *, timeout_s: float) -> None:
         """Begin to agree on keys, and hear a word in *timeout_s*; `start_client` waits until it is done."""
         self.banner_timeout = timeout_s

@@ -104,7 +104,7 @@ def test_section_of_an_included_file_in_a_section_that_does_not_apply_is_not_rea
 def test_match_final_sees_what_all_else_has_decided(config):
     file = config("Match final user pi\n  Port 5\nHost *\n  User pi\n")
 
-    assert lookup(file, "any") == {"user": "pi", "port": "5"}
+    assert lookup(file, "any") == {"hostname": "any", "user": "pi", "port": "5"}
 
 
 def test_included_file_keeps_to_the_section_that_includes_it(config):
@@ -202,12 +202,29 @@ Match originalhost c
 """
 
 
+FINAL = """
+Host 10.0.0.*
+  ProxyJump gate
+Host a b
+  HostName 10.0.0.7
+Host b c 10.0.0.7
+  Port 2200
+Match final
+  HostName elsewhere
+  User two
+Host *
+  User one
+"""
+"""Read twice, the second time with what the first has made of the host; some distributions ask for it of everybody."""
+
+
 @pytest.mark.process
 @pytest.mark.parametrize("host", ["a", "b", "c", "d"])
-def test_same_as_ssh_itself_says(config, host):
+@pytest.mark.parametrize("text", [CASES, FINAL])
+def test_same_as_ssh_itself_says(config, host, text):
     if shutil.which("ssh") is None:
         pytest.skip("needs OpenSSH's ssh")
-    file = config(CASES)
+    file = config(text)
     said = subprocess.run(
         ["ssh", "-G", "-F", str(file), host], capture_output=True, text=True, check=True
     ).stdout

@@ -186,6 +186,22 @@ def test_file_that_is_no_key_is_named(known, known_hosts):
     assert "not a private key that is understood" in caught.value.text
 
 
+def test_key_of_an_unknown_cipher_is_named_and_others_are_tried(known, tmp_path, home):
+    key = tmp_path / "other_cipher"
+    cipher = ("-Z", "chacha20-poly1305@openssh.com")
+    subprocess.run(["ssh-keygen", "-q", "-N", "secret", *cipher, "-f", key], check=True)
+    shutil.copy(known.user_key, tmp_path / "good")
+    identities = [f"  IdentityFile {name}" for name in (key, tmp_path / "good")]
+    write_configuration(home / ".ssh" / "config", "Host *", *identities)
+
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=str(key)))
+
+    assert f"{key} cannot be read (Unsupported cipher: " in caught.value.text
+    assert "ssh-add it" in caught.value.text
+    assert says(target_of(known, key_file=None)) == b"hello\n"
+
+
 def test_without_any_key_it_is_said_how_to_get_one(known):
     with failing(FailureKind.AUTHENTICATION) as caught:
         connect(target_of(known, key_file=None))
@@ -290,6 +306,19 @@ def test_key_with_a_passphrase_is_used_through_the_agent(known, agent, tmp_path,
     ssh_keys._agent_keys.cache_clear()  # a process asks its agent once; here the agent has learnt since
 
     assert says(target_of(known, key_file=str(key))) == b"hello\n"
+
+
+def test_key_with_which_the_agent_does_not_sign_leaves_the_others(known, agent, home, tmp_path):
+    refused = make_key(tmp_path / "refused", "ed25519")
+    nobody = {"SSH_ASKPASS": "/bin/false", "SSH_ASKPASS_REQUIRE": "force"}
+    subprocess.run(["ssh-add", "-q", "-c", refused], check=True, env={**os.environ, **nobody})
+
+    with failing(FailureKind.AUTHENTICATION) as caught:
+        connect(target_of(known, key_file=None))
+    shutil.copy(known.user_key, home / ".ssh" / "id_ed25519")
+
+    assert "the ssh agent does not sign with " in caught.value.text
+    assert says(target_of(known, key_file=None)) == b"hello\n"
 
 
 def test_public_key_as_identity_names_one_that_the_agent_holds(known, agent, tmp_path):
@@ -418,8 +447,8 @@ def test_what_is_no_name_is_told(known):
 
 
 @contextlib.contextmanager
-def speaking_server(answer: bytes):
-    """A server that says something and closes."""
+def speaking_server(answer: bytes, *, stays: bool = False):
+    """A server that says something and closes, or hears the other side out before."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve():
@@ -428,6 +457,8 @@ def speaking_server(answer: bytes):
                     connection, _ = listener.accept()
                     with connection:
                         connection.sendall(answer)
+                        while stays and connection.recv(4096):
+                            pass
 
         thread = threading.Thread(target=serve, daemon=True)
         thread.start()
@@ -454,6 +485,21 @@ def test_server_of_another_protocol_is_told(known):
         connect(target_of(known, port=port), DEFAULT)
 
     assert "Indecipherable protocol version" in caught.value.text
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        b"\0\0\0\x0c\xc8" + b"x" * 200,  # more padding than packet
+        b"\0\0\0\x14\x04\x01\0\0\0\x02\0\0\0\x02\xff\xfe" + b"x" * 8,  # no text
+    ],
+)
+def test_server_that_speaks_a_broken_ssh_is_no_defect(known, packet):
+    server = speaking_server(b"SSH-2.0-test\r\n" + packet, stays=True)
+    with server as port, failing(FailureKind.LOST) as caught:
+        connect(target_of(known, port=port), DEFAULT)
+
+    assert "what it said is not understood: " in caught.value.text
 
 
 def test_server_that_names_itself_and_says_nothing_more_is_frozen(known):

@@ -8,6 +8,7 @@ import pytest
 from ssh_harness import write_configuration
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.fleet.ssh.known_hosts import HostKey, KnownHosts
 from cosmos_cli.fleet.ssh.settings import settings_of
 from cosmos_cli.fleet.target import Target
 
@@ -113,6 +114,22 @@ def test_jump_that_is_none_and_command_that_is_none_are_no_proxies(configure):
     assert (settings().jumps, settings().proxy_command) == ((), None)
 
 
+@pytest.mark.parametrize(
+    ("lines", "jumps", "command"),
+    [
+        (["ProxyCommand none", "ProxyJump gate"], [], None),
+        (["ProxyCommand nc gate", "ProxyJump gate"], [], "nc gate"),
+        (["ProxyJump gate", "ProxyCommand nc gate"], ["gate"], None),
+        (["ProxyJump none", "ProxyCommand nc gate"], [], "nc gate"),
+    ],
+)  # as `ssh -G` has it
+def test_of_jump_and_command_the_first_counts(configure, lines, jumps, command):
+    configure(*lines)
+
+    assert [jump.address for jump in settings().jumps] == jumps
+    assert settings().proxy_command == command
+
+
 def test_jump_that_is_not_understood_is_told(configure):
     configure("ProxyJump pi@")
 
@@ -145,6 +162,19 @@ def test_several_known_hosts_files_are_read_in_their_order(home):
     )
 
     assert settings().known_hosts == (home / "a", Path("/with space/b"))
+
+
+def test_own_known_hosts_that_are_none_leave_everybodys_as_it_is(home, tmp_path):
+    everybodys = tmp_path / "ssh_known_hosts"
+    (home / ".ssh" / "config").write_text(
+        f"UserKnownHostsFile none\nGlobalKnownHostsFile {everybodys}\n"
+    )
+    known = KnownHosts(settings().known_hosts)
+
+    known.record("pi", HostKey(kind="ssh-ed25519", blob=b"a"))
+
+    assert everybodys in settings().known_hosts
+    assert not everybodys.exists()
 
 
 def test_home_of_nobody_leads_nowhere(configure):

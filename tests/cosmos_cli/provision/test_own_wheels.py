@@ -67,6 +67,13 @@ def test_a_wheel_is_kept_under_its_hash(folder):
     assert path.read_bytes() == wheel.read_bytes()
 
 
+def test_a_wheel_of_which_nobody_knows_what_it_needs_is_refused(folder):
+    wheel = make_wheel(folder / "dist", "motor", "0.2", requires=["a b c"])
+
+    with pytest.raises(InputError, match="requirements: ./dist/motor.*METADATA"):
+        with_own_wheels([f"./dist/{wheel.name}"], folder)
+
+
 def test_a_folder_is_built_once_until_it_changes(folder):
     first = with_own_wheels(["./cars"], folder)
     os.utime(folder / "cars/cars.py")

@@ -21,7 +21,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.provision import sent_wheels
 from cosmos_cli.provision.lock import Locked
 from cosmos_cli.provision.platform import Platform
-from cosmos_cli.provision.sent_wheels import sent_wheel
+from cosmos_cli.provision.sent_wheels import SentWheel, sent_wheel
 from cosmos_cli.system import file_lock, ownership
 
 HERE = Platform(python=sys.version_info[:2], machine="x86_64", libc_version=(2, 36))
@@ -142,6 +142,23 @@ def test_wheel_that_record_contradicts_is_sent_as_it_came(made):
     sent = sent_wheel(path, locked, HERE)
 
     assert (sent.path, sent.locked, sent.is_verified) == (path, locked, False)
+
+
+@pytest.mark.parametrize("fault", ["stream", "record"])
+def test_damaged_wheel_is_sent_as_it_came(made, fault):
+    path, locked = made("numpy")
+    with zipfile.ZipFile(path) as wheel:
+        content = {entry.filename: wheel.read(entry) for entry in wheel.infolist()}
+    if fault == "record":
+        content["numpy-99.0.dist-info/RECORD"] = b"numpy/__init__.py\n"  # neither hash nor size
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as wheel:
+        for name, data in content.items():
+            wheel.writestr(name, data)
+    if fault == "stream":
+        head, name, rest = path.read_bytes().partition(b"numpy/core.py")
+        path.write_bytes(head + name + b"\xff" * 4 + rest[4:])
+
+    assert sent_wheel(path, locked, HERE) == SentWheel(locked=locked, path=path, is_verified=False)
 
 
 PACK = """
