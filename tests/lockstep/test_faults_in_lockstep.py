@@ -57,6 +57,24 @@ def between(run, agent, sender):
     return [what[1] for _, who, what in rows if who == sender]
 
 
+@pytest.fixture
+def restarted(start_host):
+    """Return the result of a run in which agent-04 is restarted at 0.3 s, and back at 0.5 s."""
+    run = start_host(
+        simulation=f"{HARNESS}/returning_simulation.py:simulation",
+        timeline=(entry("restart"),),
+        restarts_max=0,
+    )
+    return run.result()
+
+
+def test_what_the_host_sends_with_the_initial_data_of_one_that_returns_arrives(restarted):
+    agents = restarted["agents"]
+
+    assert all(agent["simulation"]["told"].count("welcome") == 1 for agent in agents.values())
+    assert agents["agent-04"]["messages"]["not_sent"] == 0
+
+
 KINDS = {
     "kill": [entry("kill")],
     "kill and return": [entry("kill", for_s=0.3)],
