@@ -330,9 +330,9 @@ class Worker:
                 agent = LockstepAgent(index, self._mates, life=life, devices=devices)
             except MadnsError as error:
                 raise AgentFailed(index, str(error)) from error
-            agent.is_running = True
             self._agents = sorted((*self._agents, agent), key=lambda each: each.index)
             self._set_up_one(agent, packed, has_devices=devices is not None)
+            agent.is_running = True  # as between machines: what sets itself up has no clock yet
         return self._done()
 
     def _fault(self, t_s: float, told: list[Any], indices: list[int]) -> bytes:

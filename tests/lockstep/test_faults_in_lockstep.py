@@ -75,6 +75,12 @@ def test_what_the_host_sends_with_the_initial_data_of_one_that_returns_arrives(r
     assert agents["agent-04"]["messages"]["not_sent"] == 0
 
 
+def test_no_deadline_is_taken_in_set_up_by_one_that_returns_either(restarted):
+    told = [agent["simulation"]["told"][0] for agent in restarted["agents"].values()]
+
+    assert set(told) == {"deadline_s is simulated time, which has not begun"}
+
+
 KINDS = {
     "kill": [entry("kill")],
     "kill and return": [entry("kill", for_s=0.3)],
