@@ -292,6 +292,7 @@ class Worker:
             if isinstance(message, Delivery):
                 agent.mailbox.add(message)
                 continue
+            agent.mailbox.begin(self._clock.t_s)
             is_action = isinstance(message, ActionOrder)
             doing = frames.REFUSED if isinstance(message, TransmissionRefusal) else frames.RECEIVING
             self._position[0] = index * POSITIONS + (frames.ACTING if is_action else doing)

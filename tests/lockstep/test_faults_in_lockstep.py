@@ -81,6 +81,16 @@ def test_no_deadline_is_taken_in_set_up_by_one_that_returns_either(restarted):
     assert set(told) == {"deadline_s is simulated time, which has not begun"}
 
 
+def test_what_is_sent_to_agents_on_a_message_of_the_host_is_of_its_tick_and_not_late(restarted):
+    agents, carried = restarted["agents"], restarted["between_agents"]
+
+    for name in ("agent-02", "agent-03"):
+        told, counts = (agents[name]["simulation"][key] for key in ("told", "counts"))
+        assert told[-1] == ["passed on", 0.4, 0.5]
+        assert counts == {"received": 1, "held": 0, "late": 0, "no_room": 0}
+    assert carried["known_late"] == 0
+
+
 KINDS = {
     "kill": [entry("kill")],
     "kill and return": [entry("kill", for_s=0.3)],
