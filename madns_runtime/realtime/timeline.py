@@ -105,6 +105,8 @@ class HostTimeline:
     def _order(self, order: OrderedAction) -> str:
         if not self._port.is_in(HostState.SIMULATION_START) or self._port.now_s() < 0.0:
             return "simulated time does not run at present"
+        if self._is_over():
+            return "the run is ending"
         refusal = self.runner.order(order, self._port.now_s())
         self._arm()
         self._pump()
@@ -131,9 +133,13 @@ class HostTimeline:
     def _met(self, met: MetCondition) -> None:
         if self._port.t0_s is None or self._port.now_s() < 0.0:
             self._early.append(met)
-        elif self._port.is_in(HostState.SIMULATION_START):
+        elif self._port.is_in(HostState.SIMULATION_START) and not self._is_over():
             self.runner.met(met.condition.number, met.t_s, self._port.now_s())
         self._arm()
+
+    def _is_over(self) -> bool:
+        """Tell whether agents make their summaries: nothing takes place any more."""
+        return self._port.now_s() > self._report.duration_s
 
     def _stop(self) -> None:
         tick_hz, now_s = self._config.agents.tick_hz, self._port.now_s()
