@@ -47,6 +47,8 @@ class HostTimeline:
         self._config = config = core.launch.config
         self._port = core.port
         self._report = report
+        self._conditions = conditions
+        conditions.end_s = config.time.duration_s
         self._pump = core.pump
         self._reactor = core.reactor
         self.faults = HostFaults(core)
@@ -146,7 +148,7 @@ class HostTimeline:
         end_s = math.ceil((max(now_s, 0.0) + STOP_LEAD_S) * tick_hz) / tick_hz
         if end_s >= self._report.duration_s:
             return
-        self._report.duration_s = self._end_s = end_s
+        self._report.duration_s = self._end_s = self._conditions.end_s = end_s
         self.runner.close()
         self.faults.end_at(end_s)
         for agent in self._config.agents.resolved_names():

@@ -279,6 +279,21 @@ def test_the_host_notes_what_is_met_calls_who_waits_and_ends_the_run_that_is_to_
     assert host.unknown_count == 1
 
 
+@pytest.mark.parametrize(("end_s", "ended"), [(5.5, ["b"]), (5.4, [])])
+def test_a_check_that_is_broken_behind_the_end_of_a_run_costs_nobody_its_summary(end_s, ended):
+    broken, endings, journal = condition(number=2, name="slip", ends_run=True), [], Journal()
+    host = HostConditions(
+        [broken], tick_hz=10.0, now_s=lambda: 5.5, end=lambda who, *_: endings.append(who)
+    )
+    host.end_s = end_s
+
+    host.hear("b", 2, 5.25)
+    host.settle(journal)
+
+    assert [event["event"] for event in journal.events] == ["condition_met"]
+    assert endings == ended
+
+
 def test_conditions_travel_to_agents_and_word_of_them_to_the_host():
     config = RunConfig(
         run="r",

@@ -89,16 +89,17 @@ def a_timeline(
 
 
 def test_an_agent_that_returns_before_a_stop_takes_effect_hears_of_it() -> None:
-    session = Session()
-    timeline, core = a_timeline(session, ScheduledEntry(action="stop", at_s=2.0))
+    session, conditions = Session(), some_conditions()
+    stop = ScheduledEntry(action="stop", at_s=2.0)
+    timeline, core = a_timeline(session, stop, conditions=conditions)
     timeline.resume("a")
-    assert session.heard == []
+    assert (session.heard, conditions.end_s) == ([], 60.0)
 
     timeline._due()
     session.away.clear()
     timeline.resume("b")
 
-    assert core.report.duration_s == 2.3
+    assert core.report.duration_s == conditions.end_s == 2.3
     assert session.heard == [("a", "stop", 2.3), ("b", "stop", 2.3)]
     assert session.end_host_s == 102.3
 
