@@ -121,10 +121,10 @@ class HostFaults:
         self._port.must_pump = True
         return is_there
 
-    def lost(self, agent: str) -> bool:
-        """Note that an agent is lost, and tell whether that was ordered."""
+    def lost(self, agent: str) -> str | None:
+        """Note that an agent is lost, and return why if that was ordered."""
         incarnation = len(self._port.session.peers[agent].incarnations_seen)
-        return self.intended.take(agent, incarnation) is not None
+        return self.intended.take(agent, incarnation)
 
     def returned(self, agent: str) -> None:
         """Note that an agent is back."""
