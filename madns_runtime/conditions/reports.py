@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -89,6 +90,8 @@ class HostConditions:
             report=lambda number, agent, t_s: self.hear(agent, number, t_s),
         )
         """For the recorder of the host's half."""
+        self.end_s = math.inf
+        """Simulated time at which the run ends anyway, s: a check that is broken behind it ends nothing, and is judged as ever."""
         self.unknown_count = 0
         """Reports of conditions that the run does not have: messages that nobody can have meant."""
 
@@ -120,5 +123,5 @@ class HostConditions:
             )
             for call in self._waiting.get(met.condition.number, ()):
                 call(met)
-            if met.condition.ends_run:
+            if met.condition.ends_run and met.heard_s <= self.end_s:
                 self._end(*ending_of(met), BROKEN)

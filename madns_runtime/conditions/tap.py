@@ -24,7 +24,7 @@ class ConditionTap:
         source: An agent's name, or `host`.
         conditions: All of the run.
         tick_hz: Rate of agents' ticks: a record of a tick is of its time.
-        now_s: Returns the simulated time, s, for records that tell none.
+        now_s: Returns the simulated time, s, for records that tell none; those before it runs are of its begin.
         report: Told of each condition that is met.
         counted: Of an earlier incarnation in this process what `counts` returned: its records are not read again.
     """
@@ -147,7 +147,7 @@ class ConditionTap:
             condition = evaluator.condition
             value = read(condition.field) if condition.field else 1.0
             # On record such a time is null, which counts as 0 where a condition, and who judges the run, looks at times.
-            own_s = (None if condition.is_timed else self._now_s()) if is_timeless else t_s
+            own_s = (None if condition.is_timed else self._present_s()) if is_timeless else t_s
             self._note(who, evaluator, evaluator.take(own_s, value))
 
     def _note(self, who: str, evaluator: ConditionEvaluator, met_s: float | None) -> None:
@@ -160,7 +160,11 @@ class ConditionTap:
             return lambda read: _seconds(read(TIME))
         if TICK in fields and self._source != HOST:
             return lambda read: _seconds(read(TICK), self._tick_hz)
-        return lambda read: self._now_s()
+        return lambda read: self._present_s()
+
+    def _present_s(self) -> float | None:
+        now_s = self._now_s()
+        return None if now_s is None else max(now_s, 0.0)
 
 
 def _seconds(value: Any, per_s: float = 1.0) -> float | None:

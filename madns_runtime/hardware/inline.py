@@ -173,17 +173,20 @@ class InlineDevice:
             self._failure = error
             self._note_error(str(error))
 
-    def insert_fault(self, action: str, value: float | None) -> None:
+    def insert_fault(self, action: str, value: float | None, t_s: float) -> None:
         """
-        Put a fault in force, or clear all.
+        Put a fault in force, or clear all, at simulated time *t_s*, s: the samples before it are as they were.
 
         One that is disconnected is made safe, and lost at once: no sample of it is heard, and nothing is put out.
 
         Raises:
             ConfigurationError: There is no such fault, its value is none, or it would alter nothing.
         """
+        before_s = math.nextafter(t_s, -math.inf)
+        if before_s > self._handed_s:
+            self.follow(before_s)
         self._intake.insert_fault(action, value)
-        now_s = self._now_s()
+        now_s = t_s
         self._intake.event("fault", now_s, action=action, value=value)
         is_open = self._page.header[page.STATE] == page.OPEN
         if self._intake.faults.is_disconnected and is_open:

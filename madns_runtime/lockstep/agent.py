@@ -262,7 +262,7 @@ class AgentDevices:
 
     def take_fault(self, order: ActionOrder) -> None:
         """
-        Insert a fault around a device, or clear all of it.
+        Insert a fault around a device, or clear all of it, at the time of the order.
 
         Raises:
             ActionRefused: There is no such device, or the fault is none.
@@ -273,7 +273,7 @@ class AgentDevices:
                 continue
             word, value = ("clear", None) if order.is_end else (fault.fault, fault.value)
             try:
-                device.insert_fault(word, value)
+                device.insert_fault(word, value, order.t_s)
             except ConfigurationError as error:
                 raise ActionRefused(str(error)) from None
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.protocol.messages import ActionOrder
 from madns_runtime.timeline.action import ActionHandler
 from madns_runtime.timeline.fault_kinds import FAULT_WORDS
+from madns_runtime.timeline.kinds import DEVICE_FAULT
 
 
 class LockstepTimeline:
@@ -96,6 +98,10 @@ class LockstepTimeline:
         self.runner.close()
 
     def _post(self, agent: str, order: ActionOrder) -> bool:
+        if (
+            order.word == DEVICE_FAULT.word
+        ):  # of the present, at its end as well: between two ticks it cuts samples
+            order = dataclasses.replace(order, t_s=self._clock.t_s)
         try:
             return self._outbox.post(agent, order)
         except MadnsError:  # it takes nothing more before simulated time goes on

@@ -292,6 +292,7 @@ class Worker:
             if isinstance(message, Delivery):
                 agent.mailbox.add(message)
                 continue
+            agent.mailbox.begin(self._clock.t_s)
             is_action = isinstance(message, ActionOrder)
             doing = frames.REFUSED if isinstance(message, TransmissionRefusal) else frames.RECEIVING
             self._position[0] = index * POSITIONS + (frames.ACTING if is_action else doing)
@@ -330,9 +331,9 @@ class Worker:
                 agent = LockstepAgent(index, self._mates, life=life, devices=devices)
             except MadnsError as error:
                 raise AgentFailed(index, str(error)) from error
-            agent.is_running = True
             self._agents = sorted((*self._agents, agent), key=lambda each: each.index)
             self._set_up_one(agent, packed, has_devices=devices is not None)
+            agent.is_running = True  # as between machines: what sets itself up has no clock yet
         return self._done()
 
     def _fault(self, t_s: float, told: list[Any], indices: list[int]) -> bytes:

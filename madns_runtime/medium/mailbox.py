@@ -58,7 +58,9 @@ class Mailbox:
         self._post = post
         self._number = (life - 1) * NUMBERS_PER_LIFE
         self.tick_s = -math.inf
-        """Time of the newest tick; none has begun before."""
+        """Time of the newest tick, which what is sent bears; none has begun before."""
+        self._taken_s = -math.inf
+        """Time of the newest tick whose messages were received."""
         self._serial = 0
         self._held: list[tuple[float, str, float, int, Delivery]] = []
         self._received = self._late = self._refused = 0
@@ -117,15 +119,22 @@ class Mailbox:
         if len(self._held) >= HELD_MAX:
             self._refused += 1
             return
-        is_over = delivery.arrives_s <= self.tick_s + TIME_EPSILON_S
-        self._late += is_over and delivery.sent_s < self.tick_s  # none is received in its own tick
+        is_over = delivery.arrives_s <= self._taken_s + TIME_EPSILON_S
+        self._late += (
+            is_over and delivery.sent_s < self._taken_s
+        )  # none is received in its own tick
         self._serial += 1
         entry = (delivery.arrives_s, delivery.sender, delivery.sent_s, self._serial, delivery)
         heapq.heappush(self._held, entry)
 
+    def begin(self, t_s: float) -> None:
+        """Take *t_s* for the time of the newest tick, though what is received in it is asked for later; nothing before the first."""
+        if self.tick_s > -math.inf:
+            self.tick_s = t_s
+
     def due(self, t_s: float) -> Sequence[Delivery]:
         """Begin the tick at *t_s*: return what is received in it, in order, and forget it."""
-        self.tick_s = t_s
+        self.tick_s = self._taken_s = t_s
         held = self._held
         if not held:  # as in most ticks
             return ()

@@ -84,7 +84,7 @@ class AgentPort:
             name,
             config.conditions,
             tick_hz=config.agents.tick_hz,
-            now_s=self.t_s,
+            now_s=self.now_s,  # of one that returns the present time, in its set-up as well
             report=self._condition_met,
             counted=counted,
         )

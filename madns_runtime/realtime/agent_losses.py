@@ -42,7 +42,10 @@ class AgentLosses:
 
     def lost(self, agent: str, reason: str, *, may_tell: bool) -> None:
         """Note a loss, and tell the half of it if that can take it."""
-        if self._faults.lost(agent):
+        if (why := self._faults.lost(agent)) is not None:
+            reason = (
+                why  # as in lockstep, whether its process was its own and was killed, or goes on
+            )
             self._report.intended_lost[agent] = reason
             self._announced.log("warning", f"{agent} is lost on purpose: {reason}")
         else:

@@ -35,7 +35,8 @@ class HostFaults:
         self._messages = MessageFaults(
             config.agents.resolved_names(),
             config.seed,
-            now_s=port.now_s,
+            # As in lockstep: what is held beyond the end of the run is left, also while agents make their summaries.
+            now_s=lambda: min(port.now_s(), self._duration_s),
             ends=MessageEnds(
                 receive=lambda agent, message: guard(half.take_now, agent, message),
                 send=port.send,
@@ -120,10 +121,10 @@ class HostFaults:
         self._port.must_pump = True
         return is_there
 
-    def lost(self, agent: str) -> bool:
-        """Note that an agent is lost, and tell whether that was ordered."""
+    def lost(self, agent: str) -> str | None:
+        """Note that an agent is lost, and return why if that was ordered."""
         incarnation = len(self._port.session.peers[agent].incarnations_seen)
-        return self.intended.take(agent, incarnation) is not None
+        return self.intended.take(agent, incarnation)
 
     def returned(self, agent: str) -> None:
         """Note that an agent is back."""
@@ -139,7 +140,10 @@ class HostFaults:
 
     def _arm(self) -> None:
         next_s, t0_s = self._messages.next_s(), self._port.t0_s
-        self._timer.reschedule(math.inf if next_s is None or t0_s is None else t0_s + next_s)
+        if next_s is None or t0_s is None or next_s > self._duration_s:
+            self._timer.reschedule(math.inf)
+        else:
+            self._timer.reschedule(t0_s + next_s)
 
     def _due(self) -> None:
         if not self._port.is_in(HostState.SIMULATION_START):

@@ -138,6 +138,7 @@ class PacedTicks:
         faults = self._faults
         if faults.is_hung:
             faults.withheld += 1
+            self._port.mailbox.begin(tick.t_s)  # what it sends meanwhile is of this tick
             return
         began_s = monotonic()
         self._calls.step(tick)

@@ -47,6 +47,8 @@ class HostTimeline:
         self._config = config = core.launch.config
         self._port = core.port
         self._report = report
+        self._conditions = conditions
+        conditions.end_s = config.time.duration_s
         self._pump = core.pump
         self._reactor = core.reactor
         self.faults = HostFaults(core)
@@ -105,6 +107,8 @@ class HostTimeline:
     def _order(self, order: OrderedAction) -> str:
         if not self._port.is_in(HostState.SIMULATION_START) or self._port.now_s() < 0.0:
             return "simulated time does not run at present"
+        if self._is_over():
+            return "the run is ending"
         refusal = self.runner.order(order, self._port.now_s())
         self._arm()
         self._pump()
@@ -131,16 +135,20 @@ class HostTimeline:
     def _met(self, met: MetCondition) -> None:
         if self._port.t0_s is None or self._port.now_s() < 0.0:
             self._early.append(met)
-        elif self._port.is_in(HostState.SIMULATION_START):
+        elif self._port.is_in(HostState.SIMULATION_START) and not self._is_over():
             self.runner.met(met.condition.number, met.t_s, self._port.now_s())
         self._arm()
+
+    def _is_over(self) -> bool:
+        """Tell whether agents make their summaries: nothing takes place any more."""
+        return self._port.now_s() > self._report.duration_s
 
     def _stop(self) -> None:
         tick_hz, now_s = self._config.agents.tick_hz, self._port.now_s()
         end_s = math.ceil((max(now_s, 0.0) + STOP_LEAD_S) * tick_hz) / tick_hz
         if end_s >= self._report.duration_s:
             return
-        self._report.duration_s = self._end_s = end_s
+        self._report.duration_s = self._end_s = self._conditions.end_s = end_s
         self.runner.close()
         self.faults.end_at(end_s)
         for agent in self._config.agents.resolved_names():

@@ -84,10 +84,10 @@ def test_a_condition_on_a_number_of_records_is_met_by_the_last_of_them():
     assert [evaluator.take(t, 11.0) for t in range(3)] == [None, None, 2.0]
 
 
-def tapped(conditions, source="a", **more):
+def tapped(conditions, source="a", now_s=99.0, **more):
     told = []
     report = lambda *met: told.append(met)  # noqa: E731
-    tap = ConditionTap(source, conditions, tick_hz=10.0, now_s=lambda: 99.0, report=report, **more)
+    tap = ConditionTap(source, conditions, tick_hz=10.0, now_s=lambda: now_s, report=report, **more)
     return tap, told
 
 
@@ -105,6 +105,19 @@ def test_a_tap_takes_a_records_own_time_from_t_s_or_its_tick_or_the_clock():
 
     assert told == [(1, "a", 2.5), (2, "a", 7.5), (3, "a", 99.0)]
     assert tap.open("other", ("tick", "speed_m_s")) is None
+
+
+@pytest.mark.parametrize("now_s", [-0.5, -0.1, 0.0, None])
+def test_what_is_recorded_before_simulated_time_counts_as_of_its_begin(now_s):
+    lasting, timed = condition(for_s=5.0), condition(number=1, from_s=0.0)
+    tap, told = tapped((lasting, timed), now_s=now_s)
+
+    tap.open("drive", ("speed_m_s",))((11.0,))
+    tap.look(4.9)
+    assert told == [(1, "a", 0.0)]
+    tap.look(5.0)
+
+    assert told == [(1, "a", 0.0), (0, "a", 5.0)]
 
 
 @pytest.mark.parametrize("t_s", [math.nan, math.inf, -math.inf])
@@ -264,6 +277,21 @@ def test_the_host_notes_what_is_met_calls_who_waits_and_ends_the_run_that_is_to_
     assert [(each.agent, each.t_s, each.delay_s) for each in met] == [("a", 5.0, 0.5)]
     assert endings == [("b", "expectation slip is broken at t = 5.25 s", "broken")]
     assert host.unknown_count == 1
+
+
+@pytest.mark.parametrize(("end_s", "ended"), [(5.5, ["b"]), (5.4, [])])
+def test_a_check_that_is_broken_behind_the_end_of_a_run_costs_nobody_its_summary(end_s, ended):
+    broken, endings, journal = condition(number=2, name="slip", ends_run=True), [], Journal()
+    host = HostConditions(
+        [broken], tick_hz=10.0, now_s=lambda: 5.5, end=lambda who, *_: endings.append(who)
+    )
+    host.end_s = end_s
+
+    host.hear("b", 2, 5.25)
+    host.settle(journal)
+
+    assert [event["event"] for event in journal.events] == ["condition_met"]
+    assert endings == ended
 
 
 def test_conditions_travel_to_agents_and_word_of_them_to_the_host():

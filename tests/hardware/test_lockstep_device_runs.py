@@ -256,6 +256,36 @@ timeline:
 """
 
 
+def test_a_fault_between_two_ticks_alters_the_samples_of_its_time(tmp_path):
+    scenario = tmp_path / "swift.yaml"
+    scenario.write_text("""
+name: swift
+simulation: counter
+agents: {count: 1, tick_hz: 10}
+time: {duration_s: 1, mode: lockstep}
+hardware:
+  devices:
+    - name: gps
+      kind: synthetic
+      rate_hz: 100
+      parameters: {channels: [{name: value, elements: [{shape: sine, amplitude: 1.0}]}]}
+timeline:
+  - {at_s: 0.33, action: device_fault, agents: ["*"], device: gps, fault: bias, value: 100, for_s: 0.03}
+  - {at_s: 0.55, action: device_fault, agents: ["*"], device: gps, fault: bias, value: 100, for_s: 0.3}
+""")
+    cosmos = CosmosCommand(tmp_path)
+
+    _, run = cosmos.run(scenario, *LOOSE)
+
+    folder = cosmos.directory(run) / "devices/agent-01/gps"
+    rows = [json.loads(line) for line in (folder / "value.jsonl").read_text().splitlines()]
+    altered = [row[0] for row in rows if isinstance(row, list) and row[-1] > 50.0]
+    assert altered == [number / 100 for number in (33, 34, 35, *range(55, 85))]
+    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+    told = [event["t_s"] for event in events if event.get("event") == "fault"]
+    assert told == [0.33, 0.36, 0.55, 0.85]
+
+
 def test_a_fault_that_would_alter_nothing_is_refused_before_the_run(tmp_path):
     (tmp_path / "line.py").write_text(FRAMES)
     (tmp_path / "biased.yaml").write_text(BIASED)

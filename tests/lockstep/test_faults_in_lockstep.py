@@ -57,6 +57,40 @@ def between(run, agent, sender):
     return [what[1] for _, who, what in rows if who == sender]
 
 
+@pytest.fixture
+def restarted(start_host):
+    """Return the result of a run in which agent-04 is restarted at 0.3 s, and back at 0.5 s."""
+    run = start_host(
+        simulation=f"{HARNESS}/returning_simulation.py:simulation",
+        timeline=(entry("restart"),),
+        restarts_max=0,
+    )
+    return run.result()
+
+
+def test_what_the_host_sends_with_the_initial_data_of_one_that_returns_arrives(restarted):
+    agents = restarted["agents"]
+
+    assert all(agent["simulation"]["told"].count("welcome") == 1 for agent in agents.values())
+    assert agents["agent-04"]["messages"]["not_sent"] == 0
+
+
+def test_no_deadline_is_taken_in_set_up_by_one_that_returns_either(restarted):
+    told = [agent["simulation"]["told"][0] for agent in restarted["agents"].values()]
+
+    assert set(told) == {"deadline_s is simulated time, which has not begun"}
+
+
+def test_what_is_sent_to_agents_on_a_message_of_the_host_is_of_its_tick_and_not_late(restarted):
+    agents, carried = restarted["agents"], restarted["between_agents"]
+
+    for name in ("agent-02", "agent-03"):
+        told, counts = (agents[name]["simulation"][key] for key in ("told", "counts"))
+        assert told[-1] == ["passed on", 0.4, 0.5]
+        assert counts == {"received": 1, "held": 0, "late": 0, "no_room": 0}
+    assert carried["known_late"] == 0
+
+
 KINDS = {
     "kill": [entry("kill")],
     "kill and return": [entry("kill", for_s=0.3)],

@@ -1,5 +1,6 @@
 """Faults that the host of a run in real time orders of agents: who is being killed hears of no other."""
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -92,13 +93,19 @@ def test_an_agent_that_no_host_would_take_back_again_is_not_sent_away_to_return(
     assert [(agent, order.number) for agent, order in session.sent] == [("b", 1), ("a", 2)]
 
 
-def test_what_a_fault_holds_beyond_the_end_is_not_handed_in_after_the_summary() -> None:
-    now_s, handed_in = [10.0], []
+@pytest.mark.parametrize(
+    ("end_s", "behind", "then_s"),
+    [(60.0, HostState.BEGIN_SHUTDOWN, 12.0), (11.2, HostState.SIMULATION_START, 11.6)],
+)
+def test_what_a_fault_holds_beyond_the_end_is_not_handed_in(
+    end_s: float, behind: HostState, then_s: float
+) -> None:
+    now_s, handed_in, armed = [10.0], [], []
     state = [HostState.SIMULATION_START]
-    timer = SimpleNamespace(reschedule=lambda when_s: None)
+    timer = SimpleNamespace(reschedule=armed.append)
     config = SimpleNamespace(
         on_agent_loss="continue",
-        time=SimpleNamespace(duration_s=60.0),
+        time=SimpleNamespace(duration_s=end_s),
         seed=1,
         agents=SimpleNamespace(resolved_names=lambda: ("a", "b")),
     )
@@ -138,9 +145,10 @@ def test_what_a_fault_holds_beyond_the_end_is_not_handed_in_after_the_summary() 
 
     now_s[0] = 11.2
     faults._due()
-    state[0], now_s[0] = HostState.BEGIN_SHUTDOWN, 12.0
+    state[0], now_s[0] = behind, then_s
     faults._due()
 
     assert handed_in == ["in time"]
     with_host = faults.to_mapping()["with_host"]
     assert (with_host["late"], with_host["released"], with_host["left"]) == (2, 1, 1)
+    assert [when_s for when_s in armed if end_s < when_s < math.inf] == []

@@ -9,6 +9,7 @@ from madns_runtime.conditions.condition import Condition, ValueBounds
 from madns_runtime.conditions.reports import HostConditions
 from madns_runtime.realtime.timeline import HostTimeline
 from madns_runtime.timeline.entries import ScheduledEntry
+from madns_runtime.timeline.runner import OrderedAction
 
 
 class Session:
@@ -88,16 +89,17 @@ def a_timeline(
 
 
 def test_an_agent_that_returns_before_a_stop_takes_effect_hears_of_it() -> None:
-    session = Session()
-    timeline, core = a_timeline(session, ScheduledEntry(action="stop", at_s=2.0))
+    session, conditions = Session(), some_conditions()
+    stop = ScheduledEntry(action="stop", at_s=2.0)
+    timeline, core = a_timeline(session, stop, conditions=conditions)
     timeline.resume("a")
-    assert session.heard == []
+    assert (session.heard, conditions.end_s) == ([], 60.0)
 
     timeline._due()
     session.away.clear()
     timeline.resume("b")
 
-    assert core.report.duration_s == 2.3
+    assert core.report.duration_s == conditions.end_s == 2.3
     assert session.heard == [("a", "stop", 2.3), ("b", "stop", 2.3)]
     assert session.end_host_s == 102.3
 
@@ -175,3 +177,33 @@ def test_what_would_end_behind_the_run_is_ordered_of_no_agent_that_has_made_its_
 
     assert events.words == ["action_began", "action_began", "action_ended"]
     assert [word for _, word, _ in session.heard] == ["hang"] * 3
+
+
+@pytest.mark.parametrize(("now_s", "begun"), [(59.9, ["action_began"]), (60.1, [])])
+def test_what_waits_for_a_condition_that_the_host_hears_of_behind_the_end_takes_place_no_more(
+    now_s: float, begun: list[str]
+) -> None:
+    condition = Condition(
+        number=0, name="last", stream="x", field="y", bounds=ValueBounds.above(1.0), agents=("a",)
+    )
+    conditions, events, session = some_conditions(condition), Events(), Session()
+    entry = ScheduledEntry(action="hang", condition=0, agents=("a",))
+    _, core = a_timeline(session, entry, conditions=conditions, events=events)
+    core.port.now_s = lambda: now_s
+
+    conditions.hear("a", 0, 59.9)
+    conditions.settle(events)
+
+    assert events.words == ["condition_met", *begun]
+
+
+def test_an_order_behind_the_end_is_refused_while_agents_make_their_summaries() -> None:
+    events, order = Events(), OrderedAction(word="annotate", parameters={"text": "late"})
+    timeline, core = a_timeline(Session(), events=events)
+
+    core.port.now_s = lambda: 60.1
+    assert timeline._order(order) == "the run is ending"
+    core.port.now_s = lambda: 59.9
+    assert timeline._order(order) == ""
+
+    assert events.words == ["action_began"]

@@ -54,7 +54,6 @@ Scores = dict[tuple[str, str, str, str], PredictionScore]
 TIME_DECIMALS = 6
 """Times nearer each other are one."""
 AXES = ("radial", "along", "normal")
-
 ESTIMATES, COMMANDS, MANEUVERS = "estimates", "commands", "host_maneuvers"
 SLOT_ERROR = "slot_error_deg"
 SETTLED_SHARE = 0.1
