@@ -119,7 +119,7 @@ class Stick:
     def close(self): pass
 class SenseHat:
     def __init__(self): self.stick = Stick()
-    def set_rotation(self, degrees): pass
+    def set_rotation(self, degrees, redraw=True): pass
     def set_imu_config(self, *what): pass
     def get_raw(self): return {"x": 0.0, "y": 0.0, "z": 1.0}
     get_gyroscope_raw = get_accelerometer_raw = get_compass_raw = get_raw
