@@ -34,6 +34,7 @@ TIMEOUTS = Timeouts(
     complete_s=4,
     shutdown_s=3,
 )
+PINGS = PingPlan()
 DURATION_S = 5.0
 STEP_S = 0.005
 
@@ -61,7 +62,7 @@ class World:
         self.host_is_dead = False
         self.host_sets_up = True
 
-    def join(self, name, pings=PingPlan()):  # noqa: B008 - frozen
+    def join(self, name, pings=PINGS):
         self.incarnation += 1
         self.agents[name] = AgentSession(
             AgentIdentity(

@@ -61,8 +61,9 @@ def test_agents_are_found_by_their_second_names(monkeypatch, tmp_path, ordered, 
     plan = {"labels": {"column": "satellite", "names": names}}
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     orders = []
-    take = lambda path, name, order: orders.append(order) or {"refusal": ""}  # noqa: E731
-    monkeypatch.setattr(module, "order_action", take)
+    monkeypatch.setattr(
+        module, "order_action", lambda path, name, order: orders.append(order) or {"refusal": ""}
+    )
 
     assert inject("last", target, "slow", "factor=2") == 0
     assert [(order["target"], order["agents"]) for order in orders] == [(target, agents)]
