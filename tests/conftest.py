@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import pytest
+from harness.warm_commands import WarmCommands
 from harness.wheel_cache import VARIABLE
 from hypothesis import HealthCheck, settings
 
@@ -108,6 +109,7 @@ def marker_of_processes(request, monkeypatch):
         (subprocess.Popen, "__init__"),
         (multiprocessing.process.BaseProcess, "start"),
         (os, "fork"),
+        (WarmCommands, "start"),
     ):
         monkeypatch.setattr(owner, name, noted(getattr(owner, name), f"{owner.__name__}.{name}"))
     yield

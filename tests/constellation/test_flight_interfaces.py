@@ -15,6 +15,7 @@ from pathlib import Path
 
 import guided_program
 import pytest
+from harness.cosmos_command import CosmosCommand
 from harness.waiting import wait_until
 from test_flight_process import HZ, PATIENCE_S, Ship, patience  # noqa: F401 - a fixture
 
@@ -91,15 +92,7 @@ def test_the_same_guidance_gives_the_same_maneuvers_to_the_bit_by_every_way(tmp_
     scenario["parameters"] |= {"satellites": {"keplerian": orbits}, "flight": rules}
     (tmp_path / "ways.yaml").write_text(json.dumps(scenario))
 
-    done = subprocess.run(
-        [sys.executable, "-m", "cosmos_cli.app", "run", "ways.yaml", "--quiet", "--no-report"],
-        cwd=tmp_path,
-        env={**os.environ, "COSMOS_STATE_DIR": str(tmp_path / "state")},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+    done = CosmosCommand(tmp_path)("run", "ways.yaml", "--quiet", "--no-report")
 
     assert done.returncode == 0, done.stderr
     run = tmp_path / "runs/0001-ways"

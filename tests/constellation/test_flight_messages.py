@@ -2,14 +2,13 @@
 
 import functools
 import json
-import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import jsonschema
 import pytest
+from harness.cosmos_command import CosmosCommand
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.simulations.constellation.flight.interface.answers import carry_out
@@ -74,15 +73,7 @@ def fly(folder, command, count):
     (folder / "spied.sh").write_text(SPY.format(command=command))
     (folder / "spied.sh").chmod(0o755)
     (folder / "spoken.yaml").write_text(SCENARIO.format(count=count))
-    done = subprocess.run(
-        [sys.executable, "-m", "cosmos_cli.app", "run", "spoken.yaml", "--quiet", "--no-report"],
-        cwd=folder,
-        env={**os.environ, "COSMOS_STATE_DIR": str(folder / "state")},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+    done = CosmosCommand(folder)("run", "spoken.yaml", "--quiet", "--no-report")
     assert done.returncode == 0, done.stderr
     return [
         [

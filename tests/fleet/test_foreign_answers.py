@@ -2,13 +2,15 @@
 
 import json
 import subprocess
+import sys
 
 import pytest
 from harness.wheel_cache import begin_cache
-from up_tower import COSMOS, UpTower
+from up_tower import UpTower
 
 pytestmark = pytest.mark.root
 
+COSMOS = (sys.executable, "-m", "cosmos_cli.start")
 HOSTILE = r"\033]0;owned\007\033[2J\033[31m\302\2331m\177\342\200\256\342\200\213[red]{task}"
 """As printf takes it; \302\233 is the one-character beginning of a control sequence."""
 RAW = set(map(chr, [*range(9), *range(11, 32), *range(0x7F, 0xA0), 0x202E, 0x200B]))
@@ -36,7 +38,7 @@ def said(fleet, *arguments):
     """Run a command off a terminal, both streams together."""
     done = subprocess.run(
         [*COSMOS, *arguments, "-i", str(fleet.inventory)],
-        env=fleet.environment,
+        env=fleet.cosmos.environment,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -65,7 +67,7 @@ def said_exec(fleet, line, *options):
     inventory = ["-i", str(fleet.inventory)]
     done = subprocess.run(
         [*COSMOS, "exec", *inventory, *options, "--", line],
-        env=fleet.environment,
+        env=fleet.cosmos.environment,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

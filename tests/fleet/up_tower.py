@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from harness.cosmos_command import CosmosCommand
 from harness.waiting import wait_until
 from tower import Tower
 
 PATIENCE_S = 180.0
-COSMOS = (sys.executable, "-m", "cosmos_cli.start")
 PLACES = "/home/pi /etc /boot/firmware /root /var/lib/dpkg/status /proc/sys/net /sys/class/rfkill"
 """All that `up` may change; contents of the kernel's files are compared by `SHOW_VALUES`."""
 LIST = f"sudo find {PLACES} -xdev ! -type d -printf '%p %m %u %s %T@ %i\\n' | LC_ALL=C sort"
@@ -68,13 +65,7 @@ class UpTower:
     def __init__(self, tower: Tower, folder: Path, cache: Path) -> None:
         self.tower = tower
         self.inventory = folder / "inventory.yaml"
-        self.environment = {
-            **os.environ,
-            **tower.operator_environment(),
-            "COSMOS_CACHE": str(cache),
-            "COSMOS_STATE_DIR": str(folder / "state"),
-            "COSMOS_RUNS": str(folder / "runs"),
-        }
+        self.cosmos = CosmosCommand(folder, **tower.operator_environment(), COSMOS_CACHE=str(cache))
         self.write()
 
     def write(
@@ -85,17 +76,10 @@ class UpTower:
     ) -> None:
         self.tower.write_inventory(self.inventory, machines, boards, **variables)
 
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            [*COSMOS, "up", "-i", str(self.inventory), *arguments],
-            env=self.environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            stdin=subprocess.DEVNULL,
-            text=True,
-        )
+    def start(self, *arguments: str) -> Any:
+        return self.cosmos.start("up", "-i", self.inventory, *arguments)
 
-    def finish(self, process: subprocess.Popen[str]) -> Result:
+    def finish(self, process: Any) -> Result:
         try:
             out, err = process.communicate(timeout=PATIENCE_S)
         finally:

@@ -1,22 +1,16 @@
 """A plug-in whose commands and records are NaN: nothing of it is green."""
 
 import json
-import subprocess
-import sys
 
 import pytest
+from harness.cosmos_command import CosmosCommand
 
-COSMOS = (sys.executable, "-m", "cosmos_cli.start")
 SPEED = "speed_m_s = GAIN_1_S * (self.mark_m - self.measured_m)"
 
 
 @pytest.mark.process
 def test_commands_and_records_of_nan_break_checks_that_name_the_agent(tmp_path):
-    def cosmos(*arguments):
-        return subprocess.run(
-            [*COSMOS, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=200
-        )
-
+    cosmos = CosmosCommand(tmp_path)
     assert cosmos("init", "rover", "--template", "plugin", "--directory", ".").returncode == 0
     plugin = tmp_path / "rover.py"
     text = plugin.read_text()

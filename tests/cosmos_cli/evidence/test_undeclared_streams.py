@@ -1,11 +1,10 @@
 """What a simulation recorded and did not declare is a remark of run.json."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from harness.cosmos_command import CosmosCommand
 from harness.synthetic_run import ROUND_TRIPS, SyntheticRun
 
 from cosmos_cli.collect.finish import finish_run
@@ -137,9 +136,8 @@ def test_run_tells_what_its_simulation_did_not_declare(tmp_path, mode):
         f"time: {{mode: {mode}, duration_s: 0.5, rtf_tolerance: 100}}\ndeadline: {{max_miss_ratio: 1}}\n"
         "timeouts: {agents_ready_s: 60, silence_s: 30}\n"
     )
-    command = [sys.executable, "-m", "cosmos_cli.app", "run", "a.yaml", "--json", "--no-report"]
 
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    done = CosmosCommand(tmp_path)("run", "a.yaml", "--json", "--no-report")
 
     remarks = json.loads(done.stdout)["remarks"]
     expected = f"agent-01 and 1 more: stream extra is {NOT_DECLARED}"

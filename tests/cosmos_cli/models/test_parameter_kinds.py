@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Annotated
 
 import pytest
 from annotated_types import Gt
+from harness.cosmos_command import CosmosCommand
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
@@ -21,9 +20,6 @@ from madns_runtime.plugin.api import ActionKind, Simulation
 from madns_runtime.plugin.registry import parse_parameters, resolve
 
 pytestmark = pytest.mark.process
-
-COSMOS = (sys.executable, "-m", "cosmos_cli.app")
-DEADLINE_S = 240
 
 PLUGIN = '''
 from __future__ import annotations
@@ -162,16 +158,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def cosmos(folder: Path, *arguments: str) -> str:
-    done = subprocess.run(
-        [*COSMOS, *arguments],
-        cwd=folder,
-        env=dict(os.environ),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE_S,
-        check=False,
-    )
+    done = CosmosCommand(folder)(*arguments)
     assert done.returncode in (0, 4), done.stdout + done.stderr
     return done.stdout
 

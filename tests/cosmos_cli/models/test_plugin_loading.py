@@ -6,17 +6,12 @@ Real processes; which of them the plug-in misbehaves in is told to it by its env
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from harness.cosmos_command import CosmosCommand
 
 pytestmark = pytest.mark.process
-
-COSMOS = (sys.executable, "-m", "cosmos_cli.app")
-DEADLINE_S = 240
 
 PLUGIN = """
 from __future__ import annotations
@@ -25,9 +20,9 @@ from dataclasses import dataclass
 from madns_runtime.plugin.api import AgentSimulation, Demand, Simulation
 
 def misbehave(stage):
-    if os.environ.get("STAGE") != stage:
+    if os.environ.get("COSMOS_TEST_STAGE") != stage:
         return
-    match os.environ["MISDEED"]:
+    match os.environ["COSMOS_TEST_MISDEED"]:
         case "exit":
             os._exit(0)
         case "kill":
@@ -104,16 +99,8 @@ def answer(tmp_path: Path):
     (tmp_path / "a.yaml").write_text(SCENARIO)
 
     def run(stage: str, misdeed: str, *arguments: str) -> tuple[int, str]:
-        done = subprocess.run(
-            [*COSMOS, *arguments],
-            cwd=tmp_path,
-            env={**os.environ, "STAGE": stage, "MISDEED": misdeed},
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=DEADLINE_S,
-            check=False,
-        )
+        told = {"COSMOS_TEST_STAGE": stage, "COSMOS_TEST_MISDEED": misdeed}
+        done = CosmosCommand(tmp_path, **told)(*arguments)
         return done.returncode, done.stdout + done.stderr
 
     return run
