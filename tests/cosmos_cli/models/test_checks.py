@@ -232,6 +232,14 @@ def test_all_faults_are_told_at_once(tmp_path):
     [
         ("lockstep", [f"{TICKS}, below: 3"], ["none can be judged, such as a: runs in lockstep"]),
         ("lockstep", [f"{TICKS}, below: 3", "name: b, event: start"], []),
+        (
+            "lockstep",
+            [
+                f"{TICKS}, statistic: first_time, when: {{above: 1}}, above: 0",
+                "name: b, event: end, after: a",
+            ],
+            ["none can be judged, such as a: runs in lockstep"],
+        ),
         ("realtime", [f"{TICKS}, below: 3"], []),
         ("lockstep", [], []),
     ],
