@@ -98,7 +98,11 @@ def scenario_checks(
 
 def unjudged_remark(expectations: Sequence[Expectation], *, is_lockstep: bool) -> str:
     """Return in words that runs of a time mode can judge none of these, and end without a result; empty where some are."""
-    if not expectations or any(e.is_judged_in(is_lockstep=is_lockstep) for e in expectations):
+    unjudged: set[str] = set()
+    for each in expectations:
+        if each.after in unjudged or not each.is_judged_in(is_lockstep=is_lockstep):
+            unjudged.add(each.name)
+    if not unjudged or len(unjudged) < len(expectations):
         return ""
     return (
         f"none can be judged, such as {expectations[0].name}: runs in lockstep do not record its stream, and this one"

@@ -129,7 +129,10 @@ class KnownStreams:
         self, declared: Sequence[DeclaredStream] | None, devices: Sequence[KnownDevice] = ()
     ) -> None:
         self._is_declared = declared is not None
-        self._channels_open = {each.name for each in devices if each.streams is None}
+        self._channels_open: dict[str, list[KnownDevice]] = {}
+        for device in devices:
+            if device.streams is None:
+                self._channels_open.setdefault(device.name, []).append(device)
         self._streams: dict[str, list[KnownStream]] = {}
         own = [
             KnownStream(role=each.role, name=each.name, fields=each.fields, is_open=each.is_open)
@@ -143,9 +146,12 @@ class KnownStreams:
     def of(self, name: str) -> list[KnownStream]:
         """Return the streams of a name: of the agents, of the host's half, or one of each; or of machines or devices."""
         found = self._streams.get(name)
-        if found is None and self._device_of(name) in self._channels_open:
-            return [KnownStream(role="device", name=name, fields=(), is_open=True)]
-        return found or []
+        if found is not None:
+            return found
+        return [
+            KnownStream(role="device", name=name, fields=(), is_open=True, sources=each.sources)
+            for each in self._channels_open.get(self._device_of(name), ())
+        ]
 
     def stream_fault(self, name: str) -> str | None:
         """Return what is wrong with a stream's name; None if it may be one."""

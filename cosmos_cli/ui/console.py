@@ -214,9 +214,10 @@ class ClosedOutput(io.TextIOBase):
 
 def open_standard_streams() -> None:
     """
-    Give descriptors 0 to 2 back to their purpose where they were closed.
+    Give descriptors 0 to 2 back to their purpose where they were closed, and a buffer to output that has none.
 
-    The next file or socket would get their numbers, and what is meant for a person would go there.
+    The next file or socket would get their numbers, and what is meant for a person would go there. Under
+    PYTHONUNBUFFERED a write that was cut, by a reader that goes or a disk that fills up, is taken for a whole one.
     """
     streams: Any = sys  # typeshed does not know that they may be None
     for descriptor in (0, 1, 2):
@@ -230,9 +231,25 @@ def open_standard_streams() -> None:
         streams.stdout = ClosedOutput()
     if streams.stderr is None:
         streams.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - as long as the process
+    for name in ("stdout", "stderr"):
+        stream = getattr(streams, name)
+        if isinstance(stream, io.TextIOWrapper) and isinstance(stream.buffer, io.RawIOBase):
+            setattr(streams, name, _buffered(stream))
     if isinstance(streams.stdout, io.TextIOWrapper):
         # As Python itself has it for stderr: under a locale that has no word for a letter it is shown as an escape.
         streams.stdout.reconfigure(errors="backslashreplace")
+
+
+def _buffered(stream: io.TextIOWrapper) -> TextIO:
+    """Return a stream to the same file, flushed after each line, in which a write that was cut goes on or fails."""
+    return open(  # noqa: SIM115 - as long as the process
+        stream.fileno(),
+        "w",
+        buffering=1,
+        encoding=stream.encoding,
+        errors=stream.errors,
+        closefd=False,
+    )
 
 
 @contextlib.contextmanager

@@ -49,6 +49,8 @@ class AgentMoved:
     agent: str
     phase: Phase
     reason: str | None = None
+    incarnation: int = 1
+    """Count of its starts when it moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,8 @@ class AgentLost:
 
     agent: str
     reason: str
+    incarnation: int = 1
+    """Which of its starts is gone: the next may be there when this is read."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,6 +69,11 @@ class Peer:
     retired_records: list[Mapping[str, Any]] = field(default_factory=list)
     """Last words of earlier incarnations, as `records`; empty of one that ended without any."""
 
+    @property
+    def incarnation(self) -> int:
+        """Count of the starts of the agent that have spoken."""
+        return len(self.incarnations_seen)
+
 
 class Roster:
     """
@@ -133,7 +138,7 @@ class Roster:
             else:
                 self.running.pop(peer.link.peer_prefix, None)
         peer.phase = phase
-        self._events.append(AgentMoved(peer.name, phase, reason))
+        self._events.append(AgentMoved(peer.name, phase, reason, peer.incarnation))
 
     def lose(self, reasons: Mapping[str, str], *, is_live: bool) -> None:
         """Take note that agents, by name, are lost and why; it is told as a loss while the host *is_live*."""
@@ -145,7 +150,7 @@ class Roster:
                 # What it has not acknowledged is lost, and counted so; a last word may still reach it.
                 peer.link.abandon(Service.RELIABLE)
             if is_live:
-                self._events.append(AgentLost(name, reason))
+                self._events.append(AgentLost(name, reason, peer.incarnation))
 
     def find_silent(self, state: HostState, now_s: float, *, is_over: bool) -> dict[str, str]:
         """

@@ -5,7 +5,8 @@ import shutil
 
 import pytest
 import yaml
-from guides import ROOT
+from guides import ROOT, blocks
+from harness.cosmos_command import CosmosCommand
 
 from cosmos_cli.models.loading import load_scenario
 from madns_runtime.simulations.constellation.actions import ACTIONS
@@ -47,6 +48,17 @@ def test_an_example_of_the_guide_is_accepted(tmp_path, number):
     path.write_text(yaml.safe_dump(scenario | yaml.safe_load(EXAMPLES[number])))
 
     assert load_scenario(path).timeline.entries
+
+
+@pytest.mark.process
+def test_the_example_of_faults_survives_them_as_its_name_says(tmp_path):
+    (example,) = blocks(FAULTS, "yaml")
+    path = tmp_path / "survivors.yaml"
+    path.write_text(example)
+
+    code, document = CosmosCommand(tmp_path).run(path)
+
+    assert (code, document["agents"]["lost_on_purpose"]) == (0, ["agent-02"]), document["verdict"]
 
 
 def test_the_guide_has_every_action_of_the_framework_and_of_a_constellation():

@@ -453,8 +453,14 @@ def test_another_process_in_an_agents_place_ends_the_first():
 
     w.run_for(1.0)
 
-    assert w.host_event(h.AgentLost) == h.AgentLost("agent-1", "another process took its place")
+    assert w.host_event(h.AgentLost) == h.AgentLost(
+        "agent-1", "another process took its place", incarnation=1
+    )
     assert w.host.peers["agent-1"].phase is Phase.RUNNING
+    moved = [e for e in w.host_events if isinstance(e, h.AgentMoved) and e.agent == "agent-1"]
+    lost = [e.phase for e in moved].index(Phase.LOST)
+    assert {e.incarnation for e in moved[: lost + 1]} == {1}
+    assert {e.incarnation for e in moved[lost + 1 :]} == {2}
 
 
 def test_datagrams_of_strangers_change_nothing_but_counters():

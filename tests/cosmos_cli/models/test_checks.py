@@ -232,6 +232,14 @@ def test_all_faults_are_told_at_once(tmp_path):
     [
         ("lockstep", [f"{TICKS}, below: 3"], ["none can be judged, such as a: runs in lockstep"]),
         ("lockstep", [f"{TICKS}, below: 3", "name: b, event: start"], []),
+        (
+            "lockstep",
+            [
+                f"{TICKS}, statistic: first_time, when: {{above: 1}}, above: 0",
+                "name: b, event: end, after: a",
+            ],
+            ["none can be judged, such as a: runs in lockstep"],
+        ),
         ("realtime", [f"{TICKS}, below: 3"], []),
         ("lockstep", [], []),
     ],
@@ -246,6 +254,23 @@ def test_checks_none_of_which_can_be_judged_are_told_before_the_run(tmp_path, mo
 
     assert len(found.remarks) == len(told)
     assert all(words in remark.text for words, remark in zip(told, found.remarks, strict=True))
+
+
+def test_a_device_with_faults_of_its_own_is_still_one_of_its_agents(tmp_path):
+    """Whoever mistyped a parameter of it was told that the device were of an inventory."""
+    text = HEAD.replace("name: gyro, unit", "name: gyro, unyt") + (
+        "  - {name: a, stream: imu.gyro, field: gyro, below: 1, agents: [agent-02]}\n"
+        "  - {name: b, stream: imu.gyro, field: gyro, below: 1, agents: [agent-01]}\n"
+    )
+
+    with pytest.raises(InputError) as refused:
+        check_scenario(text, tmp_path / "scenario.yaml")
+
+    assert [each.path for each in refused.value.faults] == [
+        "hardware.devices[0].parameters.channels[0].unyt",
+        "checks[1].agents[0]",
+    ]
+    assert "does not use what records" in refused.value.faults[1].text
 
 
 def test_more_checks_than_are_followed_are_refused(tmp_path):

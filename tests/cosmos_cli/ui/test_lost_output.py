@@ -165,6 +165,31 @@ def test_a_reader_that_has_gone_is_told_as_by_a_shell_and_not_as_a_failure() -> 
 
 
 @pytest.mark.process
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_goes_in_the_middle_is_told_also_where_python_does_not_buffer(
+    unbuffered: str,
+) -> None:
+    """Unbuffered, Python takes a write that was cut for a whole one, as containers are often set up."""
+    begin = "head -c 1 >/dev/null"
+    ended = shell(
+        f"PYTHONUNBUFFERED={unbuffered} {COSMOS} schema | {begin}; exit ${{PIPESTATUS[0]}}"
+    )
+
+    assert (ended.returncode, ended.stderr) == (141, "")
+
+
+@pytest.mark.process
+def test_a_disk_that_fills_up_in_the_middle_is_told_also_where_python_does_not_buffer(
+    tmp_path: Path,
+) -> None:
+    limit = "ulimit -f 64; trap '' XFSZ"
+    ended = shell(f"{limit}; PYTHONUNBUFFERED=1 {COSMOS} schema > {tmp_path / 'schema.json'}")
+
+    assert (tmp_path / "schema.json").stat().st_size == 65_536
+    assert (ended.returncode, ended.stderr) == (1, "error: stdout: File too large\n")
+
+
+@pytest.mark.process
 def test_commands_work_without_any_standard_stream(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("name: a\nsimulation: counter\nagents: {count: 3}\nsed: 1\n")
 
