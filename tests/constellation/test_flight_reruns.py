@@ -145,3 +145,32 @@ def test_recorded_commands_are_given_in_their_ticks_and_those_of_devices_are_not
     context.name = "agent-02"
     with pytest.raises(BlamedError, match="expected the commands of the recorded run, found none"):
         RecordedCommands().setup(context)
+
+
+def test_recorded_estimates_are_given_again_with_what_was_believed_of_nothing(tmp_path):
+    folder = tmp_path / "agent-01"
+    folder.mkdir()
+    empty = '{"schema":1,"stream":"commands","shape":"array","fields":[{"name":"tick","unit":"","kind":"int"}]}\n'
+    (folder / "commands.jsonl").write_text(empty)
+    names = [("tick", "int"), ("a_m", "float"), ("e", "float")]
+    fields = ",".join(f'{{"name":"{name}","unit":"","kind":"{kind}"}}' for name, kind in names)
+    (folder / "estimates.jsonl").write_text(
+        f'{{"schema":1,"stream":"estimates","shape":"array","fields":[{fields}]}}\n'
+        "[1,7e6,0.1]\n[3,7.1e6,null]\n[3,7.2e6,0.2]\n"
+    )
+    desk = Desk(given=[])
+    software = RecordedCommands()
+    software.setup(
+        SimpleNamespace(
+            name="agent-01", tick_hz=10.0, settings={"agents": str(tmp_path)}, estimate=desk.note
+        )
+    )
+
+    for t_s in (0.0, 0.1, 0.2, 0.3, 0.4):
+        software.step(t_s, {})
+
+    assert desk.given == [
+        ({"a_m": 7e6, "e": 0.1},),
+        ({"a_m": 7.1e6, "e": None},),
+        ({"a_m": 7.2e6, "e": 0.2},),
+    ]

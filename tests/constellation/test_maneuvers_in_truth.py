@@ -267,6 +267,15 @@ def test_commands_compose_in_the_order_of_their_times(fly):
     assert star.host.finish()["maneuvers"]["executed"] == 3
 
 
+def test_what_is_left_at_a_refill_is_not_measured_where_a_maneuver_replaces_truth(fly):
+    star = fly(["agent-02 50 inertial 4.25 1 0 0", "agent-02 200 inertial 4.25 1 0 0"])
+
+    star.run(60.0)
+
+    left_s = {name: each["left_at_refill_s_min"] for name, each in star.summaries().items()}
+    assert left_s["agent-02"] == pytest.approx(left_s["agent-01"], abs=2.0)
+
+
 def test_a_batch_under_way_when_a_command_comes_is_mended(fly):
     lines = ["agent-01 102 inertial 6 0 0 3", "agent-02 103 inertial 24 0 0 3"]
     quick, slow = fly(lines), fly(lines)

@@ -12,6 +12,7 @@ from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
     lay_out,
     snap,
 )
+from madns_runtime.simulations.constellation.truth.maneuvers.rules import WAITING_MAX
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     StretchRequest,
@@ -27,6 +28,7 @@ from madns_runtime.simulations.constellation.truth.vehicle_propagation import (
     VehicleRequest,
     propagate_vehicle,
 )
+from madns_runtime.simulations.constellation.vehicle.future_truth import FutureTruth
 from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
 
 PARAMETERS = parameters()
@@ -125,6 +127,21 @@ def flown(effects, t_s, vehicle=1):
             if effect.kind == "impulse" and effect.start_s == at_s and at_s < t_s:
                 state = state + np.array((0, 0, 0, *effect.vector))
     return state
+
+
+def test_truth_of_as_many_commands_as_may_wait_finds_room_on_the_vehicle():
+    truth = Truth(windows=18)
+    for n in range(1, WAITING_MAX):
+        truth.timeline.add(burn(2.55 + 2.7 * n, 2.95 + 2.7 * n, number=n))
+    truth.command(burn(2.55, 2.95))  # brings truth of all of them
+
+    segments = truth.store.segments(1, 0, 17)
+    buffer, future = TruthBuffer(), FutureTruth()
+    taken = [held.add(segment) for held in (buffer, future) for segment in segments]
+
+    assert len(segments) > 3 * WAITING_MAX
+    assert all(taken)
+    assert all(buffer.lookup(t_s) is not None for t_s in np.arange(0.0, 180.01, 0.1))
 
 
 @pytest.mark.slow

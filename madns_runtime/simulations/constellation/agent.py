@@ -52,7 +52,10 @@ from madns_runtime.simulations.constellation.vehicle.flight_tick import (
 )
 from madns_runtime.simulations.constellation.vehicle.recorded_results import RecordedResults
 from madns_runtime.simulations.constellation.vehicle.stimuli import Stimuli
-from madns_runtime.simulations.constellation.vehicle.truth_buffer import TruthBuffer
+from madns_runtime.simulations.constellation.vehicle.truth_buffer import (
+    TIME_EPSILON_S,
+    TruthBuffer,
+)
 from madns_runtime.simulations.constellation.vehicles import flight_of, vehicle_of
 
 EARTH_POLAR_RADIUS_M2 = EARTH_POLAR_RADIUS_M**2
@@ -95,6 +98,8 @@ class ConstellationAgent(AgentSimulation):
         for segment in (first.segment, *first.more):
             if segment is not None:
                 self._buffer.add(segment)
+        self._reached_s = self._buffer.end_s
+        """Farthest time of which truth was ever held, s: a refill goes beyond it, a change does not."""
         context.open_stream("state", STATE)
         context.open_stream("elements", ELEMENTS)
         vehicle = vehicle_of(parameters, context.name, first.satellite)
@@ -275,7 +280,8 @@ class ConstellationAgent(AgentSimulation):
     def _take_segment(self, segment: Segment) -> None:
         now_s = self._context.now_s()
         left_s = self._buffer.end_s - now_s
-        if self._buffer.add(segment):
+        if self._buffer.add(segment) and segment.end_s > self._reached_s + TIME_EPSILON_S:
+            self._reached_s = segment.end_s
             self._left_s_min = min(self._left_s_min, left_s)
         if self._stimuli is not None:
             self._stimuli.take(segment, now_s)

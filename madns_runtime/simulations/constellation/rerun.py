@@ -2,9 +2,9 @@
 How a recorded run is flown again: software that can be stepped flies as it is today, other software is played back.
 
 Of software behind a device the device's record has the bytes; of software that was only attached to, or has a clock of
-its own, the commands are on record. All software is told what became of its commands in the ticks in which it was told
-then: in lockstep it would hear of it a tick earlier, and all that it is sent would move with that. Of a run that was in
-lockstep itself it hears of it when it did, without a record.
+its own, commands and estimates are on record, but not what its messages held. All software is told what became of its
+commands in the ticks in which it was told then: in lockstep it would hear of it a tick earlier, and all that it is sent
+would move with that. Of a run that was in lockstep itself it hears of it when it did, without a record.
 """
 
 from __future__ import annotations
@@ -92,7 +92,10 @@ def _played(rule: FlightRule, number: int, run: Path, remarks: list[str]) -> Fli
     if isinstance(rule, FlightProcess) and interface.clock == "stepped":
         return rule
     why = "it has a clock of its own" if interface.clock == "own" else "it was only attached to"
-    remarks.append(f"{which}: cannot be stepped, as {why}: its recorded commands are given again")
+    remarks.append(
+        f"{which}: cannot be stepped, as {why}: its recorded commands and estimates are given again, but no messages, "
+        "whose content is not on record"
+    )
     settings: dict[str, bool | int | float | str | list[float] | list[str]] = {
         "agents": str(run / "agents")
     }

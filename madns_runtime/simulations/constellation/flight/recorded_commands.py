@@ -1,4 +1,4 @@
-"""Flight software that gives the commands of a recorded run again, each in the tick in which it was given."""
+"""Flight software that gives the commands and the estimates of a recorded run again, each in the tick in which it was given."""
 
 from __future__ import annotations
 
@@ -28,27 +28,30 @@ class RecordedCommands(FlightSoftware):
 
     def setup(self, context: FlightContext) -> None:
         """
-        Read what was commanded.
+        Read what was commanded and what was believed.
 
         Raises:
             BlamedError: No commands of this agent are on record.
         """
         self._context = context
-        self._rows: dict[int, list[dict[str, Any]]] = defaultdict(list)
-        path = Path(str(context.settings["agents"])) / context.name / "commands.jsonl"
+        folder = Path(str(context.settings["agents"])) / context.name
+        path = folder / "commands.jsonl"
         if not path.is_file():
             raise BlamedError(f"{path}: expected the commands of the recorded run, found none")
-        stream = read_stream(path)
-        names = stream.field_names
-        for values in stream.records():
-            row = dict(zip(names, values, strict=True))
-            if row["number"] < DEVICES_FROM:
-                self._rows[row["tick"]].append(row)
+        self._rows = {
+            tick: [row for row in rows if row["number"] < DEVICES_FROM]
+            for tick, rows in _rows_by_tick(path).items()
+        }
+        path = folder / "estimates.jsonl"
+        self._believed = _rows_by_tick(path) if path.is_file() else {}
 
     def step(self, t_s: float, readings: Readings) -> None:
-        """Give the commands of this tick, in the first of its steps: in real time that took all that had come."""
+        """Give commands and estimates of this tick, in the first of its steps: in real time that took all that had come."""
         context = self._context
-        rows = self._rows.get(math.ceil(t_s * context.tick_hz - TICK_TOLERANCE), [])
+        tick = math.ceil(t_s * context.tick_hz - TICK_TOLERANCE)
+        for row in self._believed.pop(tick, []):
+            context.estimate({name: row[name] for name in row if name != "tick"})
+        rows = self._rows.get(tick, [])
         given, rows[:] = rows[:COMMANDS_MAX], rows[COMMANDS_MAX:]
         for row in given:
             vector, at_s = (row["x"], row["y"], row["z"]), row["at_s"]
@@ -60,3 +63,14 @@ class RecordedCommands(FlightSoftware):
                 context.dipole(vector, at_s=at_s, duration_s=row["duration_s"])
             else:
                 context.ballistic(vector[0], at_s=at_s)
+
+
+def _rows_by_tick(path: Path) -> dict[int, list[dict[str, Any]]]:
+    """Return the records of a stream by their ticks, each as a mapping of the fields' names."""
+    found: dict[int, list[dict[str, Any]]] = defaultdict(list)
+    stream = read_stream(path)
+    names = stream.field_names
+    for values in stream.records():
+        row = dict(zip(names, values, strict=True))
+        found[row["tick"]].append(row)
+    return dict(found)

@@ -35,7 +35,7 @@ URGENT_KNOTS_MAX = 20
 STREAM = "truth"
 SENT_S_DIGITS = 6
 SEGMENTS_GIVEN_MAX = 32
-"""Given at once whatever their times; an agent takes twice as many."""
+"""Given at once whatever their times; of more, those that are over are left out."""
 LOOK_BACK_S = 1.0
 """Truth that is kept beyond a tick's time: messages name times that are over when they are heard."""
 

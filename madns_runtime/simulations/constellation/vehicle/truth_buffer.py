@@ -24,8 +24,11 @@ from madns_runtime.simulations.constellation.orbit.interpolation import (
 from madns_runtime.simulations.constellation.orbit.quaternions import IDENTITY, Vector
 from madns_runtime.simulations.constellation.thrust import Thrust
 
-SEGMENTS_MAX = 64
-"""Segments held; a host that sends more is refused and counted."""
+SEGMENTS_MAX = 512
+"""
+Segments held; a host that sends more is refused and counted. A burn has one of its own, and three lie between two burns: the
+64 commands of a vehicle that may wait at once make up to 260.
+"""
 KNOTS_HELD_MAX = 200_000
 """Knots held over all segments: about 70 MB at worst, 150 MB with attitude."""
 TIME_EPSILON_S = 1e-9
