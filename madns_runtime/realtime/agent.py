@@ -391,5 +391,6 @@ class AgentRunner:
 
     def _fail(self, failure: HalfFailed) -> None:
         self._reactor.end_if_stray()  # by sys.exit, say: whoever forked it goes on
+        self._port.flush()  # what the half sent leaves first: the word of its end would overtake it
         self._session.emergency(str(failure), monotonic())
         self._port.must_flush = True
