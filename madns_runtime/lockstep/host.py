@@ -123,6 +123,7 @@ class LockstepHost:
         self._faults = LockstepFaults(core, self._absences)
         self._timeline = LockstepTimeline(core, program, self._faults)
         self._absences.resume = self._timeline.runner.resume
+        self._absences.heed = self._take_conditions
         self._timeline.wait_for(conditions)
         self._machine = host_machine()
 
@@ -244,13 +245,7 @@ class LockstepHost:
         self._absences.take()
         self._conditions.end_s = -math.inf  # what is met from now on is noted, and nothing follows
         self._timeline.runner.close()
-        for number, service, body in self._meeting.messages():
-            account.agents[number].up[service] += 1
-            message = decode(body)
-            if isinstance(message, ConditionMet):
-                self._conditions.hear(self._names[number], message.number, message.t_s)
-            else:
-                account.agents[number].too_late += 1
+        self._take_conditions()
         self._conditions.settle(self._journal)
         for answer in self._crew.answers():
             for number, summary, deadlines_broken, counts, newest in answer[frames.LOSSES + 1]:
@@ -288,6 +283,16 @@ class LockstepHost:
             self._meeting.serve()
 
     # Conditions -----------------------------------------------------------------------------------
+
+    def _take_conditions(self) -> None:
+        """Hear what agents tell of conditions; what they sent besides is too late."""
+        for number, service, body in self._meeting.messages():
+            account, message = self._account.agents[number], decode(body)
+            account.up[service] += 1
+            if isinstance(message, ConditionMet):
+                self._conditions.hear(self._names[number], message.number, message.t_s)
+            else:
+                account.too_late += 1
 
     def _settle_conditions(self) -> None:
         """

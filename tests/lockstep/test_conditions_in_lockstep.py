@@ -1,11 +1,15 @@
 """Conditions of a run in lockstep: what is met when, and what follows."""
 
+from pathlib import Path
+
 import pytest
 
 from madns_runtime.conditions.condition import Condition, ValueBounds
 from madns_runtime.timeline.entries import ScheduledEntry
 
 pytestmark = pytest.mark.process
+
+HARNESS = Path(__file__).resolve().parents[1] / "harness"
 
 FINISHING = """
 from dataclasses import dataclass
@@ -71,3 +75,26 @@ def test_what_is_met_in_finish_is_noted_and_nothing_follows_as_in_real_time(star
         ("condition_met", "timeline[1]", "host"),
         ("end", None, None),
     ]
+
+
+def test_what_an_agent_records_of_a_fault_is_heard_of(start_host):
+    hangs = Condition(
+        number=0,
+        name="hangs",
+        stream="events",
+        field="event",
+        bounds=ValueBounds.equals("hang_begins"),
+        agents=("agent-04",),
+    )
+    run = start_host(
+        simulation=f"{HARNESS}/fault_simulation.py:simulation",
+        timeline=(
+            ScheduledEntry(action="hang", agents=("agent-04",), at_s=0.3, for_s=0.2),
+            ScheduledEntry(action="annotate", condition=0, parameters={"text": "it hangs"}),
+        ),
+        conditions=(hangs,),
+    )
+    run.result()
+
+    told = {each["event"]: each["t_s"] for each in run.events_of("host")}
+    assert told["condition_met"] == pytest.approx(0.3)
