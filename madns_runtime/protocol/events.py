@@ -49,6 +49,8 @@ class AgentMoved:
     agent: str
     phase: Phase
     reason: str | None = None
+    incarnation: int = 1
+    """Which of its starts has; another may have begun since."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,8 @@ class AgentLost:
 
     agent: str
     reason: str
+    incarnation: int = 1
+    """Which of its starts has ended; another may have begun since."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,7 +133,7 @@ class Roster:
             else:
                 self.running.pop(peer.link.peer_prefix, None)
         peer.phase = phase
-        self._events.append(AgentMoved(peer.name, phase, reason))
+        self._events.append(AgentMoved(peer.name, phase, reason, len(peer.incarnations_seen)))
 
     def lose(self, reasons: Mapping[str, str], *, is_live: bool) -> None:
         """Take note that agents, by name, are lost and why; it is told as a loss while the host *is_live*."""
@@ -145,7 +145,7 @@ class Roster:
                 # What it has not acknowledged is lost, and counted so; a last word may still reach it.
                 peer.link.abandon(Service.RELIABLE)
             if is_live:
-                self._events.append(AgentLost(name, reason))
+                self._events.append(AgentLost(name, reason, len(peer.incarnations_seen)))
 
     def find_silent(self, state: HostState, now_s: float, *, is_over: bool) -> dict[str, str]:
         """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from madns_runtime.protocol.events import AgentLost
 from madns_runtime.realtime.announcements import Announcements
 from madns_runtime.realtime.host_core import RealtimeCore
 from madns_runtime.realtime.host_faults import HostFaults
@@ -40,9 +41,10 @@ class AgentLosses:
         self._now_s = core.port.now_s
         self._reasons: dict[str, str] = {}
 
-    def lost(self, agent: str, reason: str, *, may_tell: bool) -> None:
+    def lost(self, event: AgentLost, *, may_tell: bool) -> None:
         """Note a loss, and tell the half of it if that can take it."""
-        if (why := self._faults.lost(agent)) is not None:
+        agent, reason = event.agent, event.reason
+        if (why := self._faults.lost(agent, event.incarnation)) is not None:
             reason = (
                 why  # as in lockstep, whether its process was its own and was killed, or goes on
             )

@@ -7,7 +7,6 @@ from typing import Any
 
 from madns_runtime.plugin.api import HOST
 from madns_runtime.protocol.events import AgentMoved
-from madns_runtime.protocol.host_peers import Peer
 from madns_runtime.protocol.states import HostState
 from madns_runtime.recording.run_journal import RunJournal
 
@@ -30,13 +29,13 @@ class Announcements:
         self._journal.event("state", state=state.value)
         self._emit({"event": "state", "state": state.value})
 
-    def agent_moved(self, event: AgentMoved, peer: Peer) -> None:
-        """Tell the new phase of an agent, *peer*."""
+    def agent_moved(self, event: AgentMoved) -> None:
+        """Tell the new phase of an agent."""
         moved = {
             "agent": event.agent,
             "state": event.phase.value,
             "reason": event.reason,
-            "incarnation": len(peer.incarnations_seen),
+            "incarnation": event.incarnation,
         }
         self._journal.event("agent", **moved)
         self._emit({"event": "agent", **moved})

@@ -215,14 +215,14 @@ class HostRuntime:
                     self._guard(self._half.take, agent, payload, service)
             case told.HostStateEntered(state):
                 self._announced.state(state)
-            case told.AgentMoved(agent):
-                self._announced.agent_moved(event, self._session.peers[agent])
+            case told.AgentMoved():
+                self._announced.agent_moved(event)
             case told.AgentsReady():
                 self._set_up()
             case told.AgentsSimulationReady():
                 self._start()
-            case told.AgentLost(agent, reason):
-                self._losses.lost(agent, reason, may_tell=self._is_set_up)
+            case told.AgentLost():
+                self._losses.lost(event, may_tell=self._is_set_up)
             case told.AgentRejoining(agent):
                 self._send_setup(agent)
             case told.AgentRejoined(agent):

@@ -121,9 +121,8 @@ class HostFaults:
         self._port.must_pump = True
         return is_there
 
-    def lost(self, agent: str) -> str | None:
-        """Note that an agent is lost, and return why if that was ordered."""
-        incarnation = len(self._port.session.peers[agent].incarnations_seen)
+    def lost(self, agent: str, incarnation: int) -> str | None:
+        """Note that an agent is lost, in which of its starts, and return why if that was ordered."""
         return self.intended.take(agent, incarnation)
 
     def returned(self, agent: str) -> None:

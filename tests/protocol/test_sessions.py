@@ -453,7 +453,11 @@ def test_another_process_in_an_agents_place_ends_the_first():
 
     w.run_for(1.0)
 
-    assert w.host_event(h.AgentLost) == h.AgentLost("agent-1", "another process took its place")
+    lost = w.host_event(h.AgentLost)
+    assert lost == h.AgentLost("agent-1", "another process took its place", incarnation=1)
+    moved = [e for e in w.host_events if isinstance(e, h.AgentMoved) and e.agent == "agent-1"]
+    assert [e.incarnation for e in moved if e.phase is Phase.LOST] == [1]
+    assert moved[-1].incarnation == 2
     assert w.host.peers["agent-1"].phase is Phase.RUNNING
 
 

@@ -63,7 +63,7 @@ def test_a_second_kill_of_one_that_is_being_killed_does_not_say_when_it_returns(
     assert faults.begin(an_action(2, "kill", "a", "b", for_s=1.0)) == ["a"]
 
     assert [(agent, order.number) for agent, order in session.sent] == [("a", 0), ("b", 2)]
-    assert faults.lost("a")
+    assert faults.lost("a", 1)
     assert faults.intended.returns_s("a") is None
     assert faults.intended.returns_s("b") == 11.0
 
@@ -71,7 +71,7 @@ def test_a_second_kill_of_one_that_is_being_killed_does_not_say_when_it_returns(
 def test_one_that_was_killed_and_is_back_can_be_killed_again() -> None:
     faults, session = some_faults()
     faults.begin(an_action(0, "kill", "a", for_s=1.0))
-    assert faults.lost("a")
+    assert faults.lost("a", 1)
     faults.returned("a")
 
     assert faults.begin(an_action(1, "kill", "a", for_s=1.0)) == []
