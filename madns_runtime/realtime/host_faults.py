@@ -9,6 +9,7 @@ from time import monotonic
 from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.faults.message_faults import MessageEnds, MessageFaults
 from madns_runtime.protocol.host_peers import INCARNATIONS_MAX
+from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import AgentFault, Service
 from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_core import RealtimeCore
@@ -117,9 +118,11 @@ class HostFaults:
         ]
 
     def _send(self, agent: str, order: AgentFault) -> bool:
-        is_there = self._port.session.send(agent, order, Service.SYNC, monotonic())
         self._port.must_pump = True
-        return is_there
+        try:
+            return self._port.session.send(agent, order, Service.SYNC, monotonic())
+        except SendQueueFull:  # it takes nothing
+            return False
 
     def lost(self, agent: str, incarnation: int) -> str | None:
         """Note that an agent is lost, in which of its starts, and return why if that was ordered."""

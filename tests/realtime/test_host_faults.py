@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from madns_runtime.protocol.host_peers import INCARNATIONS_MAX
+from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import AgentFault, Service
 from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_faults import HostFaults
@@ -18,9 +19,12 @@ class Session:
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, AgentFault]] = []
+        self.full: set[str] = set()
         self.peers = {name: SimpleNamespace(incarnations_seen=["x"]) for name in ("a", "b")}
 
     def send(self, agent: str, order: AgentFault, *_: Any) -> bool:
+        if agent in self.full:
+            raise SendQueueFull("65536 messages wait")
         self.sent.append((agent, order))
         return True
 
@@ -91,6 +95,17 @@ def test_an_agent_that_no_host_would_take_back_again_is_not_sent_away_to_return(
     assert faults.begin(an_action(2, "kill", "a")) == [], "it is not to return"
 
     assert [(agent, order.number) for agent, order in session.sent] == [("b", 1), ("a", 2)]
+
+
+@pytest.mark.parametrize("word", ["kill", "hang"])
+def test_an_agent_that_takes_nothing_more_is_not_there(word: str) -> None:
+    faults, session = some_faults()
+    session.full.add("a")
+
+    assert faults.begin(an_action(0, word, "a", "b")) == ["a"]
+    assert not faults.intended.is_coming("a")
+    with pytest.raises(ActionRefused, match=f"nothing to {word}"):
+        faults.begin(an_action(1, word, "a"))
 
 
 @pytest.mark.parametrize(
