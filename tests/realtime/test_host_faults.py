@@ -167,3 +167,16 @@ def test_what_a_fault_holds_beyond_the_end_is_not_handed_in(
     with_host = faults.to_mapping()["with_host"]
     assert (with_host["late"], with_host["released"], with_host["left"]) == (2, 1, 1)
     assert [when_s for when_s in armed if end_s < when_s < math.inf] == []
+
+
+def test_one_that_is_killed_as_it_returns_is_lost_on_purpose_once_more() -> None:
+    faults, _ = some_faults()
+    faults.begin(an_action(0, "kill", "a", for_s=1.0))
+    faults.lost("a", 1)
+    faults.begin(an_action(1, "kill", "a", for_s=1.0))
+    faults.returned("a")  # it had said so before it heard of the second
+
+    assert faults.intended.is_coming("a")
+    assert faults.lost("a", 2)
+    assert faults.intended.returns_s("a") == 11.0
+    assert faults.intended.incarnations("a") == [1, 2]
