@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+RETURN_S_MIN: Final = 0.2
+"""Least time from an agent's end by a fault to its return, s."""
 RETURN_S_MAX: Final = 5.0
 """Time that a return may take beyond its moment, s of simulated time: a process starts and sets itself up."""
 

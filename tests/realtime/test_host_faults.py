@@ -32,7 +32,7 @@ class Session:
         del are_expected
 
 
-def some_faults() -> tuple[HostFaults, Session]:
+def some_faults(now_s: float = 10.0) -> tuple[HostFaults, Session]:
     session = Session()
     config = SimpleNamespace(
         on_agent_loss="continue",
@@ -40,7 +40,7 @@ def some_faults() -> tuple[HostFaults, Session]:
         seed=1,
         agents=SimpleNamespace(resolved_names=lambda: ("a", "b")),
     )
-    port: Any = SimpleNamespace(session=session, now_s=lambda: 10.0, send=None, must_pump=False)
+    port: Any = SimpleNamespace(session=session, now_s=lambda: now_s, send=None, must_pump=False)
     core: Any = SimpleNamespace(
         launch=SimpleNamespace(config=config),
         port=port,
@@ -167,6 +167,26 @@ def test_what_a_fault_holds_beyond_the_end_is_not_handed_in(
     with_host = faults.to_mapping()["with_host"]
     assert (with_host["late"], with_host["released"], with_host["left"]) == (2, 1, 1)
     assert [when_s for when_s in armed if end_s < when_s < math.inf] == []
+
+
+@pytest.mark.parametrize(("now_s", "returns"), [(58.7, True), (59.0, False), (59.5, False)])
+def test_one_that_would_return_behind_the_end_does_not(now_s: float, returns: bool) -> None:
+    faults, session = some_faults(now_s)
+
+    assert faults.begin(an_action(0, "kill", "a", for_s=1.0)) == []
+    assert faults.begin(an_action(1, "restart", "b")) == []
+
+    kill, restart = (order.value for _, order in session.sent)
+    assert kill == 1.0 if returns else math.isnan(kill)
+    assert restart == 0.0
+
+
+def test_one_that_is_started_anew_right_before_the_end_does_not_return() -> None:
+    faults, session = some_faults(59.9)
+
+    faults.begin(an_action(0, "restart", "a"))
+
+    assert math.isnan(session.sent[0][1].value)
 
 
 def test_one_that_is_killed_as_it_returns_is_lost_on_purpose_once_more() -> None:
