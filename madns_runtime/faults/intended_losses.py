@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+RETURN_S_MIN: Final = 0.2
+"""Least time from an agent's end by a fault to its return, s."""
 RETURN_S_MAX: Final = 5.0
 """Time that a return may take beyond its moment, s of simulated time: a process starts and sets itself up."""
 
@@ -72,9 +74,10 @@ class IntendedLosses:
         return absence is not None and absence.is_awaited
 
     def returned(self, agent: str) -> None:
-        """Note that an agent is back."""
-        if (absence := self._absences.get(agent)) is not None:
-            absence.is_away = absence.is_awaited = False
+        """Note that an agent is back; a loss that was ordered of it meanwhile has still to come true."""
+        absence = self._absences.get(agent)
+        if absence is not None and not absence.is_awaited:
+            absence.is_away = False
 
     def returns_s(self, agent: str) -> float | None:
         """Return the simulated time at which a lost agent is to return, s; None if it is not."""

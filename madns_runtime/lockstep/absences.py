@@ -21,6 +21,10 @@ def _nobody_waits(agent: str) -> None:
     """Do nothing."""
 
 
+def _nobody_heeds() -> None:
+    """Do nothing."""
+
+
 class Absences:
     """
     The agents that are away.
@@ -48,6 +52,8 @@ class Absences:
         """Simulated time, s, and agent, by index: a heap."""
         self.resume: Callable[[str], None] = _nobody_waits
         """Told of an agent that has returned, when its half and the host's know of it."""
+        self.heed: Callable[[], None] = _nobody_heeds
+        """Hears what agents told as a fault of theirs began or ended."""
 
     def begin(self) -> None:
         """Go on without who is lost from now on, if the run is to."""
@@ -164,3 +170,4 @@ class Absences:
             told = dataclasses.astuple(fault)
             self._meeting.order(worker, frames.FAULT, self._clock.t_s, told, own)
         self._meeting.await_told("has not begun a fault")
+        self.heed()

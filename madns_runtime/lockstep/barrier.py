@@ -203,15 +203,13 @@ class Meeting:
             raise RunEnds
 
     def messages(self) -> Iterator[tuple[int, int, bytes]]:
-        """Yield what the agents sent: whose it is, its class of service, its body."""
+        """Yield what the agents sent, in their order: whose it is, its class of service, its body."""
         sent = []
         for answer in self._crew.answers():
             self._account.note_values(answer[2])
-            if not self._crew.are_mixed:
-                yield from answer[1]
-            else:
-                sent += answer[1]
-        yield from sorted(sent, key=itemgetter(0))  # of one agent, as it sent them
+            sent += answer[1]
+        # A worker tells first what all its agents answered, then their steps; of one agent, as it sent them.
+        yield from sorted(sent, key=itemgetter(0))
 
     def stop_workers(self, reason: str | None) -> tuple[str, ...]:
         """Have all close their records and end; return the agents of which there is no word that they did."""

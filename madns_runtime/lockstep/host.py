@@ -9,6 +9,7 @@ clock to what comes next. Nothing in it depends on the wall clock but how long i
 from __future__ import annotations
 
 import contextlib
+import math
 from functools import partial
 from pathlib import Path
 from time import monotonic
@@ -122,6 +123,7 @@ class LockstepHost:
         self._faults = LockstepFaults(core, self._absences)
         self._timeline = LockstepTimeline(core, program, self._faults)
         self._absences.resume = self._timeline.runner.resume
+        self._absences.heed = self._take_conditions
         self._timeline.wait_for(conditions)
         self._machine = host_machine()
 
@@ -241,9 +243,10 @@ class LockstepHost:
         limit_s, setting = max((timeouts.tick_s, "tick_s"), (timeouts.complete_s, "complete_s"))
         self._meeting.await_all(limit_s, "has not summed itself up", setting)
         self._absences.take()
-        for number, service, _ in self._meeting.messages():
-            account.agents[number].up[service] += 1
-            account.agents[number].too_late += 1
+        self._conditions.end_s = -math.inf  # what is met from now on is noted, and nothing follows
+        self._timeline.runner.close()
+        self._take_conditions()
+        self._conditions.settle(self._journal)
         for answer in self._crew.answers():
             for number, summary, deadlines_broken, counts, newest in answer[frames.LOSSES + 1]:
                 account.agents[number].summary = summary
@@ -254,6 +257,7 @@ class LockstepHost:
         # The view's last picture stays on the terminal: without this one of some moment before the end.
         self._meeting.operator.emit(account.progress(self._clock.t_s, monotonic()))
         account.simulation = self._guarded.finish()
+        self._conditions.settle(self._journal)
         self._outbox.give_up()
 
     def _t_s(self) -> float | None:
@@ -279,6 +283,16 @@ class LockstepHost:
             self._meeting.serve()
 
     # Conditions -----------------------------------------------------------------------------------
+
+    def _take_conditions(self) -> None:
+        """Hear what agents tell of conditions; what they sent besides is too late."""
+        for number, service, body in self._meeting.messages():
+            account, message = self._account.agents[number], decode(body)
+            account.up[service] += 1
+            if isinstance(message, ConditionMet):
+                self._conditions.hear(self._names[number], message.number, message.t_s)
+            else:
+                account.too_late += 1
 
     def _settle_conditions(self) -> None:
         """

@@ -73,8 +73,6 @@ class Workers:
         self.workers: list[WorkerProcess] = []
         self._by_agent: list[WorkerProcess] = []
         self._reactor: Reactor | None = None
-        self.are_mixed = False
-        """Whether a worker has agents of another's share: theirs are no neighbours then."""
         for share in shares:
             worker = _fork(launch, directory, share)
             self.workers.append(worker)
@@ -138,7 +136,6 @@ class Workers:
         before.agents.remove(agent)
         after.agents = sorted((*after.agents, agent))
         self._by_agent[agent] = after
-        self.are_mixed = True
         return after
 
     @property

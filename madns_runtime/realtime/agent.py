@@ -335,7 +335,8 @@ class AgentRunner:
         self._pump()
 
     def _end_early(self, reason: str, *, is_own: bool) -> None:
-        self._outcome = AgentOutcome(as_ordered=False, reason=reason, may_restart=is_own)
+        may_restart = is_own and not self._ticks.pacer.is_over  # no other start has a tick
+        self._outcome = AgentOutcome(as_ordered=False, reason=reason, may_restart=may_restart)
         self._takes_data = False
         self._cancel_timers()
         self._journal.event("emergency", reason=reason)
@@ -391,5 +392,6 @@ class AgentRunner:
 
     def _fail(self, failure: HalfFailed) -> None:
         self._reactor.end_if_stray()  # by sys.exit, say: whoever forked it goes on
+        self._port.flush()  # what the half sent leaves first: the word of its end would overtake it
         self._session.emergency(str(failure), monotonic())
         self._port.must_flush = True

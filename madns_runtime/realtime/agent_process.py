@@ -12,6 +12,7 @@ from typing import Any
 
 from madns_runtime.config import AgentLaunch
 from madns_runtime.errors import MadnsError
+from madns_runtime.faults.intended_losses import RETURN_S_MIN
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.reactor.descriptors import allow_descriptors
 from madns_runtime.reactor.operator_link import OPERATOR_SIDE_GONE
@@ -24,8 +25,6 @@ from madns_runtime.realtime.agent_report import AgentOutcome
 from madns_runtime.realtime.packs import Pack, phase_of, split_into_packs
 from madns_runtime.realtime.process_port import ProcessPort
 
-RESTART_S = 0.2
-"""Least time from an agent's end by a fault to its return to the same process."""
 ABANDON_S = 5
 """For an agent that a fault ends with its process to let go of what outlives it, at most."""
 HANG_GRACE_S = 2.0
@@ -181,7 +180,7 @@ class AgentProcess:
                 seat = next(seat for seat in self._seats if seat.name == name)
                 self._away.add(name)
                 self._process.awaited += 1
-                due_s = self._reactor.now_s() + max(after_s, RESTART_S)
+                due_s = self._reactor.now_s() + max(after_s, RETURN_S_MIN)
                 self._reactor.call_at(due_s, partial(self._return, seat))
         self._stop_if_done()
 

@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from time import monotonic
 
-from madns_runtime.faults.intended_losses import IntendedLosses
+from madns_runtime.faults.intended_losses import RETURN_S_MIN, IntendedLosses
 from madns_runtime.faults.message_faults import MessageEnds, MessageFaults
 from madns_runtime.protocol.host_peers import INCARNATIONS_MAX
+from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import AgentFault, Service
 from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_core import RealtimeCore
@@ -84,7 +85,12 @@ class HostFaults:
         after_s = 0.0 if action.word == words.RESTART else action.for_s
         returns_s = None if after_s is None else self._port.now_s() + after_s
         why = words.killed_words(action)
-        value = math.nan if after_s is None else after_s
+        value = math.nan
+        if (
+            after_s is not None
+            and self._port.now_s() + max(after_s, RETURN_S_MIN) < self._duration_s
+        ):
+            value = after_s  # else no tick would be left for it: as in lockstep it stays away
         absent = [] if after_s is None else self._worn_out(action.agents)
         if absent and len(absent) == len(action.agents):
             names = ", ".join(absent)
@@ -117,9 +123,11 @@ class HostFaults:
         ]
 
     def _send(self, agent: str, order: AgentFault) -> bool:
-        is_there = self._port.session.send(agent, order, Service.SYNC, monotonic())
         self._port.must_pump = True
-        return is_there
+        try:
+            return self._port.session.send(agent, order, Service.SYNC, monotonic())
+        except SendQueueFull:  # it takes nothing
+            return False
 
     def lost(self, agent: str, incarnation: int) -> str | None:
         """Note that an incarnation of an agent is lost, and return why if that was ordered."""

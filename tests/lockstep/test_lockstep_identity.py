@@ -107,3 +107,16 @@ def test_a_deadline_that_lies_in_the_past_is_counted(start_host):
 
     assert result["status"] == "complete"
     assert result["messages"]["sync"]["deadlines_broken"] == 6
+
+
+def test_what_agents_send_comes_in_their_order_whoever_shares_a_process(start_host):
+    simulation = "./answering_simulation.py:simulation"
+    runs = [start_host(per_process=number, simulation=simulation) for number in (6, 2, 1)]
+    for run in runs:
+        assert run.result()["status"] == "complete"
+
+    heard = runs[0].records("host/heard.jsonl")
+    in_tick = [[who, what] for t_s, who, what in heard if t_s == 0.1]
+    assert in_tick == [[f"agent-0{n}", what] for n in range(1, 7) for what in ("answer", "step")]
+    assert runs[1].hashes() == runs[0].hashes()
+    assert runs[2].hashes() == runs[0].hashes()

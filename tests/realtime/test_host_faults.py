@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from madns_runtime.protocol.host_peers import INCARNATIONS_MAX
+from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import AgentFault, Service
 from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_faults import HostFaults
@@ -18,9 +19,12 @@ class Session:
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, AgentFault]] = []
+        self.full: set[str] = set()
         self.peers = {name: SimpleNamespace(incarnations_seen=["x"]) for name in ("a", "b")}
 
     def send(self, agent: str, order: AgentFault, *_: Any) -> bool:
+        if agent in self.full:
+            raise SendQueueFull("65536 messages wait")
         self.sent.append((agent, order))
         return True
 
@@ -28,7 +32,7 @@ class Session:
         del are_expected
 
 
-def some_faults() -> tuple[HostFaults, Session]:
+def some_faults(now_s: float = 10.0) -> tuple[HostFaults, Session]:
     session = Session()
     config = SimpleNamespace(
         on_agent_loss="continue",
@@ -36,7 +40,7 @@ def some_faults() -> tuple[HostFaults, Session]:
         seed=1,
         agents=SimpleNamespace(resolved_names=lambda: ("a", "b")),
     )
-    port: Any = SimpleNamespace(session=session, now_s=lambda: 10.0, send=None, must_pump=False)
+    port: Any = SimpleNamespace(session=session, now_s=lambda: now_s, send=None, must_pump=False)
     core: Any = SimpleNamespace(
         launch=SimpleNamespace(config=config),
         port=port,
@@ -91,6 +95,17 @@ def test_an_agent_that_no_host_would_take_back_again_is_not_sent_away_to_return(
     assert faults.begin(an_action(2, "kill", "a")) == [], "it is not to return"
 
     assert [(agent, order.number) for agent, order in session.sent] == [("b", 1), ("a", 2)]
+
+
+@pytest.mark.parametrize("word", ["kill", "hang"])
+def test_an_agent_that_takes_nothing_more_is_not_there(word: str) -> None:
+    faults, session = some_faults()
+    session.full.add("a")
+
+    assert faults.begin(an_action(0, word, "a", "b")) == ["a"]
+    assert not faults.intended.is_coming("a")
+    with pytest.raises(ActionRefused, match=f"nothing to {word}"):
+        faults.begin(an_action(1, word, "a"))
 
 
 @pytest.mark.parametrize(
@@ -152,3 +167,36 @@ def test_what_a_fault_holds_beyond_the_end_is_not_handed_in(
     with_host = faults.to_mapping()["with_host"]
     assert (with_host["late"], with_host["released"], with_host["left"]) == (2, 1, 1)
     assert [when_s for when_s in armed if end_s < when_s < math.inf] == []
+
+
+@pytest.mark.parametrize(("now_s", "returns"), [(58.7, True), (59.0, False), (59.5, False)])
+def test_one_that_would_return_behind_the_end_does_not(now_s: float, returns: bool) -> None:
+    faults, session = some_faults(now_s)
+
+    assert faults.begin(an_action(0, "kill", "a", for_s=1.0)) == []
+    assert faults.begin(an_action(1, "restart", "b")) == []
+
+    kill, restart = (order.value for _, order in session.sent)
+    assert kill == 1.0 if returns else math.isnan(kill)
+    assert restart == 0.0
+
+
+def test_one_that_is_started_anew_right_before_the_end_does_not_return() -> None:
+    faults, session = some_faults(59.9)
+
+    faults.begin(an_action(0, "restart", "a"))
+
+    assert math.isnan(session.sent[0][1].value)
+
+
+def test_one_that_is_killed_as_it_returns_is_lost_on_purpose_once_more() -> None:
+    faults, _ = some_faults()
+    faults.begin(an_action(0, "kill", "a", for_s=1.0))
+    faults.lost("a", 1)
+    faults.begin(an_action(1, "kill", "a", for_s=1.0))
+    faults.returned("a")  # it had said so before it heard of the second
+
+    assert faults.intended.is_coming("a")
+    assert faults.lost("a", 2)
+    assert faults.intended.returns_s("a") == 11.0
+    assert faults.intended.incarnations("a") == [1, 2]
