@@ -224,6 +224,19 @@ def test_details_of_events_are_kept(tmp_path):
     assert details["details"].tolist() == ['{"why":"all"}']
 
 
+def test_a_field_of_an_earlier_run_that_is_called_details_keeps_its_values(tmp_path):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("contacts", (Field("t_s", "s"), Field("notes")), shape="object")
+    record(made, "agent-01", schema, [{"t_s": 1.0, "notes": 2.5}, {"t_s": 2.0, "notes": 3.5}])
+    path = made.stream("agent-01", "contacts")
+    path.write_bytes(path.read_bytes().replace(b"notes", b"details"))
+
+    gather(made.run, 10.0, quiet)
+
+    table = pq.read_table(made.run.tables / "contacts.parquet").to_pydict()
+    assert table["details"] == ["2.5", "3.5"]
+
+
 def test_stream_without_records_becomes_an_empty_table(tmp_path):
     made = SyntheticRun(tmp_path)
     record(made, "agent-01", MIXED, [])
