@@ -139,6 +139,19 @@ def test_large_integers_are_exact_where_others_of_the_field_are_null(tmp_path, m
     assert found.faults == ()
 
 
+@pytest.mark.parametrize("kind", ["packed", "str"])
+def test_a_tick_that_is_no_number_tells_no_time(tmp_path, kind):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("odd", (Field("tick", "", kind), Field("n", "", "int")))
+    record(made, "agent-01", schema, [("dawn", 1), ("dusk", 2)])
+
+    gather(made.run, 10.0, quiet)
+
+    table = pq.read_table(made.run.tables / "odd.parquet").to_pydict()
+    assert table["n"] == [1, 2]
+    assert "t_s" not in table
+
+
 def test_a_value_that_is_nested_too_deep_is_null_and_reported(tmp_path):
     made = SyntheticRun(tmp_path)
     schema = StreamSchema("odd", (Field("extra", "", "json"),))
