@@ -477,3 +477,32 @@ def test_objects_that_begin_like_another_kind_of_line_are_compared(make, capsys)
     assert contacts["rows"] == [2, 2]
     assert contacts["fields"]["end"]["different"] == 2
     assert not contacts["identical"]
+
+
+def record_calls(made, *rows):
+    fields = (Field("t_s", "s"), *(Field(n, "", "str") for n in ("sender", "receiver")))
+    schema = StreamSchema("calls", (*fields, Field("kind", "", "str")))
+    recorder = made.recorder("agents/agent-01", "agent-01", schema)
+    for row in rows:
+        recorder.record("calls", row)
+    recorder.close()
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [(("x", None, "call"), (None, "x", "call")), (("x", "a b", "c"), ("x", "a", "b c"))],
+)
+def test_records_about_others_are_no_pairs_though_their_words_are_the_same_in_a_row(
+    make, capsys, a, b
+):
+    (
+        make(lambda made: record_calls(made, (1.0, *a))),
+        make(lambda made: record_calls(made, (1.0, *b))),
+    )
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    calls = streams_of(document)["calls"]
+    assert code == 1
+    assert (calls["matched"], calls["only_a"]["count"], calls["only_b"]["count"]) == (0, 1, 1)
+    assert calls["only_a"]["first"]["who"] == "agent-01 " + " ".join(filter(None, a))
