@@ -472,8 +472,13 @@ def test_the_hosts_machine_is_not_waited_for_without_end(
     monkeypatch.setattr(log_follower, "AGAIN_S", 60.0)
     monkeypatch.setattr(log_follower.LogFollower, "_ask_connected", fails_first(failure))
 
-    assert cosmos(["logs", "--follow"]) == 3
-    assert "back again" not in capsys.readouterr().out
+    code = cosmos(["logs", "--follow"])
+    told = capsys.readouterr()
+
+    assert code == 3
+    assert "back again" not in told.out
+    assert "has ended" not in told.err
+    assert "0001-x: pi01, its host's machine, gives no answer" in told.err
 
 
 class AnswersAtOnce(SimpleQueue):
