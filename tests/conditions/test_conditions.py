@@ -66,6 +66,15 @@ def test_a_condition_that_has_to_hold_for_a_while_begins_anew_when_it_does_not()
     assert evaluator.look(6.0) is None
 
 
+def test_a_condition_has_held_until_the_record_with_which_it_does_not_any_more():
+    evaluator = ConditionEvaluator(condition(for_s=0.5))
+
+    assert [evaluator.take(t, v) for t, v in ((1.0, 11), (1.5, 5), (2.0, 11))] == [None] * 3
+    assert evaluator.look(2.0) is None
+    assert evaluator.take(3.0, 5) == 2.5
+    assert evaluator.take(4.0, 11) is None
+
+
 def test_a_while_that_is_no_binary_number_is_over_at_its_tick():
     evaluator = ConditionEvaluator(condition(for_s=0.2))
 
