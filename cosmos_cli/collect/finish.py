@@ -27,7 +27,7 @@ from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.unread_files import find_unread, told_unread
 from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.evidence.completeness import HOST, ExpectedRecords, find_missing, mapping_at
-from cosmos_cli.evidence.devices import expected_devices, read_devices
+from cosmos_cli.evidence.devices import expected_devices, read_devices, recorded_files
 from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
 from cosmos_cli.evidence.manifest import build_manifest, pack_run
 from cosmos_cli.evidence.remarks import declared_streams
@@ -237,7 +237,11 @@ def _evidence(
     sources, config = RecordingMachines.read(run), run.read_config()
     expected = dataclasses.replace(expected, devices=expected_devices(plan))
     missing = find_missing(
-        expected, gathered.scans, end.result, _unretrieved(sources, end.problems)
+        expected,
+        gathered.scans,
+        end.result,
+        _unretrieved(sources, end.problems),
+        recorded_files(run, plan, end.result),
     )
     return Evidence(
         run=run.name,

@@ -2,25 +2,27 @@
 Reads the log of a run where it lies: here, and on every machine whose records are not here yet.
 
 One thread per machine asks and waits; the lines are put together in the caller's thread. A machine that fails is
-named once, asked again while the run is followed, and holds nobody up.
+named once, asked again while the run is followed, and holds nobody up. That of the host, which alone knows when the
+run ends, is waited for a while, as for one that starts anew.
 """
 
 from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from cosmos_cli.collect.machine_sources import RecordingMachine
+from cosmos_cli.collect.machine_sources import RecordingMachine, RecordingMachines
 from cosmos_cli.collect.retrieval_state import asked_sources, read_note
 from cosmos_cli.errors import CosmosError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_log import LogLine, LogReading
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.failure import MachineFailure, unexpected
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure, unexpected
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.liveness import SilenceWatch
 from cosmos_cli.fleet.open_connection import connect
@@ -31,6 +33,18 @@ ASK_INTERVAL_S = 1.0
 LOOK_INTERVAL_S = 0.5
 AGAIN_S = 5.0
 ANSWER_TIMEOUT_S = 60.0
+ABSENCE_S = 60.0
+"""For so long the host's machine may give no answer before the run is followed no more: a board has started anew by then."""
+PASSING = frozenset(
+    {
+        FailureKind.UNREACHABLE,
+        FailureKind.REFUSED,
+        FailureKind.FROZEN,
+        FailureKind.LOST,
+        FailureKind.TIMEOUT,
+    }
+)
+"""Failures of a machine that may be well again."""
 
 Told = Mapping[str, Any]
 
@@ -67,6 +81,10 @@ class LogFollower:
     failed: set[str] = field(default_factory=set)
     """Machines whose log is not read, or not all of it."""
     _living: dict[str, bool] = field(default_factory=dict)
+    _awaited: str | None = None
+    """The host's machine, while the run is followed; None if it is this computer."""
+    _absent_since_s: float | None = None
+    """When that gave no answer first since its last one, by the monotonic clock, s."""
     _answers: SimpleQueue[_Answered] = field(default_factory=SimpleQueue)
     _stop: threading.Event = field(default_factory=threading.Event)
 
@@ -78,6 +96,7 @@ class LogFollower:
             CosmosError: A fault in the operator's own files, such as the ssh configuration.
         """
         self._living = dict.fromkeys((source.machine for source in self.sources), True)
+        self._awaited = RecordingMachines.read(self.run).host_machine if is_following else None
         for source in self.sources:
             threading.Thread(target=self._ask, args=(source, is_following), daemon=True).start()
         try:
@@ -103,14 +122,25 @@ class LogFollower:
             if answer.error is not None:
                 raise answer.error
             if answer.told is None:
-                self._living[answer.machine] = False
+                self._living[answer.machine] = self._may_return(answer)
                 if answer.machine not in self.failed and answer.failure is not None:
                     self.failed.add(answer.machine)
                     self.on_failure(answer.machine, answer.failure)
                 continue
             self.failed.discard(answer.machine)
+            if answer.machine == self._awaited:
+                self._absent_since_s = None
             self._living[answer.machine] = bool(answer.told["living"] or answer.told["more"])
             yield self.reading.take(answer.told["files"])
+
+    def _may_return(self, answer: _Answered) -> bool:
+        """Tell whether a machine that gave no answer is waited for: that of the host, for ABSENCE_S."""
+        if answer.machine != self._awaited or answer.failure is None:
+            return False
+        now_s = time.monotonic()
+        if self._absent_since_s is None:
+            self._absent_since_s = now_s
+        return answer.failure.kind in PASSING and now_s - self._absent_since_s < ABSENCE_S
 
     def _ask(self, source: RecordingMachine, is_following: bool) -> None:
         """Ask one machine until its part of the run has ended; in a thread of its own."""

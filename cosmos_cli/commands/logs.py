@@ -106,7 +106,13 @@ def logs(
     if follow:
         for portion in follower().lines(is_following=True):
             printer.print(portion)
-        console.say(f"{found.name} has ended")
+        is_known = sources.host_machine not in failed
+        console.say(
+            f"{found.name} has ended"
+            if is_known
+            else f"{found.name}: {sources.host_machine}, its host's machine, gives no answer: whether it goes on is not"
+            " known; repeat the command when that is back"
+        )
     is_silent = not printer.count and lines != 0
     machine = sources.machine_of_agent.get(source or "")
     _tell_rest(console, found, reading, level, is_silent=is_silent, machine=machine)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,8 @@ from madns_runtime.recording.records import Field
 TURN = {"deg": 360.0, "rad": 2.0 * math.pi}
 """A whole turn: angles differ by the shorter way round."""
 TEXT_CHARACTERS_MAX = 60
+SEPARATOR, NO_WORD = "\x1f", "\x1e"
+"""Between the words that tell whom a record is about, and in the place of one: what no name holds."""
 LARGE = 2**62
 TURNS_MAX = 1e6
 """Further apart two values are no angles any more, but one that diverged: of 1e200 deg no float knows the rest."""
@@ -131,10 +134,16 @@ class FieldDifference:
             self.first = place_of(a, int(is_different.argmax()))
 
 
+def subject_of(words: Iterable[object]) -> str:
+    """Return whom or what a record is about, by its words, each None where there is none: others are others."""
+    return SEPARATOR.join(NO_WORD if word is None else str(word) for word in words)
+
+
 def place_of(rows: Rows, index: int) -> RecordPlace:
     """Return where a record is."""
     who = rows.who[index]
-    return RecordPlace(float(rows.keys[index]), who if isinstance(who, str) else "")
+    words = who.split(SEPARATOR) if isinstance(who, str) else ()
+    return RecordPlace(float(rows.keys[index]), " ".join(w for w in words if w != NO_WORD))
 
 
 def _exact_difference(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.float64]:

@@ -36,8 +36,10 @@ ROWS_READ_MAX = 16_384
 """Records of one stream that are read at a time."""
 BLOCK_BYTES = 1 << 20
 CONTROL_KEYS = (b'{"t0_utc":', b'{"end":')
-CONTROL_LINE = re.compile(rb'^\{"(?:t0_utc|end)":[^\n]*\n?', re.MULTILINE)
-"""Lines that are no records: they tell when a run was, not what was recorded."""
+CONTROL_LINE = re.compile(
+    rb'^\{"(?:t0_utc": ?"[^"\n]*"|end": ?\{[^{}\n]*\})\}(?:\n|\Z)', re.MULTILINE
+)
+"""Lines that are no records: they tell when a run was, not what was recorded. A record may begin like one, and goes on."""
 Key = tuple[str, str]
 """Table and source, such as ("state", "agent-03")."""
 

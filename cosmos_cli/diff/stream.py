@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cosmos_cli.diff.fields import FieldDifference, RecordPlace, place_of
+from cosmos_cli.diff.fields import FieldDifference, RecordPlace, place_of, subject_of
 from cosmos_cli.diff.recorded import ROWS_READ_MAX, Recorded
 from cosmos_cli.evidence.streams import NUMBER_KINDS
 from madns_runtime.analysis.matching import Matched, Rows, joined, match
@@ -273,7 +273,7 @@ def _who(columns: Mapping[str, Any], identity: tuple[str, ...], count: int) -> A
         return np.zeros(count, dtype=np.int8)
     parts = [columns[name].tolist() for name in identity]
     who = np.empty(count, dtype=object)
-    who[:] = [" ".join(str(p) for p in row if p is not None) for row in zip(*parts, strict=True)]
+    who[:] = [subject_of(row) for row in zip(*parts, strict=True)]
     return who
 
 

@@ -67,7 +67,8 @@ def to_arrow(values: NDArray[Any], kind: Kind) -> tuple[pa.Array, int]:
         return _of_buffer(pa.bool_(), len(values), _bits(values), None), 0
     if kind == "int" and values.dtype.kind == "f":
         is_null = np.isnan(values)
-        is_unfit = ~is_null & ((values != np.floor(values)) | (np.abs(values) >= 2.0**63))
+        is_beyond = (values >= 2.0**63) | (values < -(2.0**63))
+        is_unfit = ~is_null & ((values != np.floor(values)) | is_beyond)
         whole = np.where(is_null | is_unfit, 0, values).astype(np.int64)
         return numbers_array(whole, is_null=is_null | is_unfit), int(is_unfit.sum())
     return _convert_each(values.tolist(), kind)
@@ -162,7 +163,7 @@ def _convert(value: Any, kind: Kind) -> Any:
     if kind == "float":
         return float(value) if _is_number(value) else None
     if kind == "int":
-        is_int64 = _is_number(value) and value == int(value) and abs(value) < 2**63
+        is_int64 = _is_number(value) and value == int(value) and -(2**63) <= value < 2**63
         return int(value) if is_int64 else None
     if kind == "bool":
         return value if isinstance(value, bool) else None

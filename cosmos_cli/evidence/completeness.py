@@ -10,6 +10,7 @@ from typing import Any
 
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import INCARNATION_MAX, StreamScan
+from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.config import RunConfig
 from madns_runtime.plain_values import mapping_at as mapping_at
 from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS, TICKS
@@ -26,6 +27,7 @@ LOCKSTEP = "lockstep"
 COUNT_MAX = 2**53
 """Largest count of a file: JSON's readers agree on whole numbers up to here."""
 NOTHING: Mapping[str, str] = MappingProxyType({})
+NO_FILES: Mapping[str, Sequence[str]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +90,7 @@ def find_missing(
     scans: Sequence[StreamScan],
     result: Mapping[str, Any] | None,
     unretrieved: Mapping[str, str] = NOTHING,
+    of_devices: Mapping[str, Sequence[str]] = NO_FILES,
 ) -> list[str]:
     """
     Return one line a source whose data are not all there, each starting with its name.
@@ -98,6 +101,7 @@ def find_missing(
         result: What the host reported; None if it could not, which is itself a gap.
         unretrieved: By machine whose records have not all come, and by agent that recorded on it, why.
             Such a machine has a line in any case: nobody else knows what it recorded beside.
+        of_devices: Names of the files into which each device recorded, as far as accounts of it tell.
     """
     agents = mapping_at(result, "agents")
     faults: dict[str, list[str]] = {HOST: [] if result is not None else ["no result"]}
@@ -114,7 +118,8 @@ def find_missing(
         own = found.get(("machine", name), ())
         _check_source(faults, name, own, expected.machine_streams, None)
     for name in expected.devices:
-        _check_device(faults, name, found.get(("device", name), ()))
+        own = found.get(("device", name), ())
+        _check_device(faults, name, own, of_devices.get(name, ()))
     _check_uninvited(faults, scans, expected)
     for name in unretrieved:
         if name not in (HOST, *expected.agents) and not faults.get(name):
@@ -179,11 +184,16 @@ def _check_source(
     )
 
 
-def _check_device(faults: dict[str, list[str]], name: str, scans: Sequence[StreamScan]) -> None:
+def _check_device(
+    faults: dict[str, list[str]], name: str, scans: Sequence[StreamScan], files: Sequence[str]
+) -> None:
     """Judge the records of a device; one that was killed leaves them cut, which `records.truncated` counts."""
     found = faults.setdefault(name, [])
     if not scans:
         found.append("no records")
+    have = {scan.file.path.name for scan in scans}
+    gone = [PurePath(file).stem for file in files if scans and PurePath(file).name not in have]
+    found.extend(f"{clean_line(stream)} is missing" for stream in gone)
     found.extend(_told(scan) for scan in scans if scan.fault and scan.promised is not None)
 
 

@@ -56,24 +56,49 @@ def read_devices(
     run: RunDirectory, plan: Mapping[str, Any], result: Mapping[str, Any] | None
 ) -> dict[str, dict[str, Any]]:
     """Return what became of each device, by its full name; of one without an account, that there is none."""
-    found: dict[str, list[Mapping[str, Any]]] = {}
     lives: dict[str, int] = {}
     for machine, names in mapping_at(plan, "devices").items():
         accounts = _accounts(run.path / "machines" / str(machine))
-        for account in accounts.values():
-            for name, told in account.items():
-                if isinstance(told, Mapping):
-                    found.setdefault(str(name), []).append(told)
         for name in names if isinstance(names, list) else ():
             lives[str(name)] = max(accounts, default=0)
-    for agent in mapping_at(result, "agents"):  # in lockstep
-        for name, told in mapping_at(result, "agents", agent, "records", "devices").items():
-            if isinstance(told, Mapping):
-                found.setdefault(f"{agent}/{name}", []).append(told)
+    found = _told(run, plan, result)
     names = dict.fromkeys((*expected_devices(plan), *found))
     return {
         clean_line(name): _joined(found.get(name, ()), lives.get(name, 0)) for name in sorted(names)
     }
+
+
+def recorded_files(
+    run: RunDirectory, plan: Mapping[str, Any], result: Mapping[str, Any] | None
+) -> dict[str, tuple[str, ...]]:
+    """Return the names of the files into which each device recorded, by its full name, as far as accounts of it tell."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name, accounts in _told(run, plan, result).items():
+        files: dict[str, None] = {}
+        for account in accounts:
+            own = mapping_at(account, "records", "streams")
+            streams = own or mapping_at(account, "report", "records", "streams")
+            named = (mapping_at(streams, each).get("file") for each in streams)
+            files |= dict.fromkeys(name for name in named if isinstance(name, str) and name)
+        found[name] = tuple(files)
+    return found
+
+
+def _told(
+    run: RunDirectory, plan: Mapping[str, Any], result: Mapping[str, Any] | None
+) -> dict[str, list[Mapping[str, Any]]]:
+    """Return all accounts of each device, by its full name: of its machine's lives, or in lockstep of the host."""
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for machine in mapping_at(plan, "devices"):
+        for account in _accounts(run.path / "machines" / str(machine)).values():
+            for name, told in account.items():
+                if isinstance(told, Mapping):
+                    found.setdefault(str(name), []).append(told)
+    for agent in mapping_at(result, "agents"):  # in lockstep
+        for name, told in mapping_at(result, "agents", agent, "records", "devices").items():
+            if isinstance(told, Mapping):
+                found.setdefault(f"{agent}/{name}", []).append(told)
+    return found
 
 
 def device_checks(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,7 +39,7 @@ def remember_run(name: str, path: Path) -> None:
 
 
 def remembered_runs() -> list[Path]:
-    """Return the directory of every run that is still where it was, by name; others are forgotten."""
+    """Return the directory of every run that is still where it was, by name; others are forgotten, unless nobody can tell."""
     return sorted(_places(), key=lambda path: (path.name, path))
 
 
@@ -49,11 +50,22 @@ def _places() -> Iterator[Path]:
         return
     for file in files:
         path = _read(file)
-        if path is not None and path.is_dir():
+        is_there = False if path is None else _is_folder(path)
+        if path is not None and is_there:
             yield path
-        else:
+        elif is_there is not None:
             with contextlib.suppress(OSError):
                 file.unlink(missing_ok=True)
+
+
+def _is_folder(path: Path) -> bool | None:
+    """Tell whether a folder is there; None where it cannot be looked at, as on a disk of the network that is away."""
+    try:
+        return stat.S_ISDIR(path.stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return False
+    except OSError:
+        return None
 
 
 def _read(file: Path) -> Path | None:

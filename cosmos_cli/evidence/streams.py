@@ -23,13 +23,14 @@ from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.reader import StreamReading, read_stream
 from madns_runtime.recording.records import FRAMEWORK_SCHEMAS, SCHEMA_VERSION, Field, StreamSchema
+from madns_runtime.recording.stream_rules import DETAILS as DETAILS_NAME
 
 SUFFIX = ".jsonl"
 INCARNATION = re.compile(r"[1-9][0-9]{0,4}")
 """In a file's name; what bears another number, to which no recorder counts, is a stream of that name."""
 INCARNATION_MAX = 99_999
 NUMBER_KINDS = ("float", "int")
-DETAILS = Field("details", "", "json")
+DETAILS = Field(DETAILS_NAME, "", "json")
 """Column of what events carry beside their fields."""
 Role = Literal["host", "agent", "machine", "device"]
 Kind = Literal["float", "int", "str", "bool", "json", "packed"]
@@ -236,7 +237,8 @@ def read_batches(file: RecordFile, reading: StreamReading) -> Iterator[tuple[Col
     for records in reading.chunks():
         columns = {name: _objects([r.get(name) for r in records]) for name in names}
         details = _objects([_details(record, names) for record in records])
-        yield {**columns, DETAILS.name: details}, len(records)
+        # A field of that name, which earlier versions let be recorded, is not put aside for what stands beside it.
+        yield {DETAILS.name: details, **columns}, len(records)
 
 
 def _details(record: Mapping[str, Any], names: Sequence[str]) -> str | None:

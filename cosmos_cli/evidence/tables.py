@@ -35,7 +35,7 @@ from cosmos_cli.evidence.arrow_values import (
     to_times,
 )
 from cosmos_cli.evidence.run_directory import RunDirectory
-from cosmos_cli.evidence.streams import DETAILS, Columns, RecordFile
+from cosmos_cli.evidence.streams import DETAILS, NUMBER_KINDS, Columns, RecordFile
 from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
 from madns_runtime.analysis.tables import AGENT, INCARNATION, RecordedRun
 from madns_runtime.conditions.condition import TIME
@@ -122,7 +122,8 @@ def plan_table(
             known = merged.get(field.name)
             merged[field.name] = field if known is None else _wider(known, field)
     role = files[0].role
-    needs_time = "tick" in merged and "t_s" not in merged and role == "agent"
+    has_tick = "tick" in merged and merged["tick"].kind in NUMBER_KINDS
+    needs_time = has_tick and "t_s" not in merged and role == "agent"
     source_column: str = role
     while source_column in merged:
         source_column += "_name"

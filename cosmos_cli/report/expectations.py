@@ -12,7 +12,16 @@ from cosmos_cli.models.expectation import Expectation, scaled
 from cosmos_cli.report.cells import format_measured
 from madns_runtime.analysis.lines import grouped_lines
 from madns_runtime.analysis.tables import RecordedRun, RecordedTable
-from madns_runtime.analysis.values import Axis, Block, Heading, LimitLine, Section, TableBlock
+from madns_runtime.analysis.values import (
+    Axis,
+    Block,
+    Figure,
+    Heading,
+    LimitLine,
+    ReportRemark,
+    Section,
+    TableBlock,
+)
 from madns_runtime.conditions.condition import AGENT, HOST, ValueBounds
 from madns_runtime.recording.records import Field
 from madns_runtime.units import conversion
@@ -44,7 +53,13 @@ def expectation_sections(run: RunDirectory, recorded: RecordedRun) -> list[Secti
     )
     expectations = planned_expectations(run.read_json(run.plan_json))
     drawn = list(_figures(expectations, results, recorded))
-    return [Section(title="Expectations", blocks=[table, *drawn[:FIGURES_MAX]])]
+    return [Section(title="Expectations", blocks=[table, *drawn[:FIGURES_MAX], *_more(drawn)])]
+
+
+def _more(drawn: Sequence[Block]) -> list[Block]:
+    """Return a remark on the figures that are too many to be shown; nothing of fewer."""
+    rest = [block.title for block in drawn[FIGURES_MAX:] if isinstance(block, Figure)]
+    return [ReportRemark(text=f"Not drawn: {'; '.join(rest)}.")] if rest else []
 
 
 def _row(check: Mapping[str, Any]) -> list[object]:
@@ -92,12 +107,14 @@ def _figure(
     series, x = recorded.series(table, field.name)
     worst = str(result.get(AGENT))
     names = expectation.agents or table.sources
-    named = [worst, *(name for name in names if name != worst)][:AGENTS_DRAWN_MAX]
+    named = [name for name in (worst, *(n for n in names if n != worst)) if name in series]
+    few = f"The first {AGENTS_DRAWN_MAX} of {len(named)}, the one that is told before the others."
     return grouped_lines(
-        {name: series[name] for name in named if name in series},
+        {name: series[name] for name in named[:AGENTS_DRAWN_MAX]},
         title=f"{expectation.name}: {expectation.words}",
         x=x,
         y=Axis(unit=field.unit),
+        note=few if len(named) > AGENTS_DRAWN_MAX else "",
         limits=_limits(expectation, field.unit),
         returns={name: recorded.returns(table, name) for name in series if name in table.sources},
     )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import orjson
 
@@ -29,6 +30,7 @@ from madns_runtime.units import conversion
 BANDS_MAX: Final = 40
 ROWS_MAX: Final = 100
 EVENTS_MAX: Final = 50_000
+"""Of actions that are read: more than a timeline, and whoever orders live, can begin and end."""
 AGENTS_TOLD_MAX: Final = 6
 LINE_BYTES_MAX: Final = 1 << 20
 INSTANT_SHARE: Final = 0.002
@@ -110,20 +112,21 @@ def _events(run: RunDirectory) -> Iterator[Mapping[str, Any]]:
         return
     try:
         with os.fdopen(open_regular_file(path), "rb") as file:
-            for _ in range(EVENTS_MAX):
-                line = file.readline(LINE_BYTES_MAX)
-                if not line:
-                    return
-                if b'"action_' not in line:
-                    continue
-                try:
-                    event = orjson.loads(line)
-                except ValueError:
-                    continue
-                if isinstance(event, dict):
-                    yield event
+            yield from itertools.islice(_events_of_actions(file), EVENTS_MAX)
     except OSError:
         return
+
+
+def _events_of_actions(file: BinaryIO) -> Iterator[Mapping[str, Any]]:
+    while line := file.readline(LINE_BYTES_MAX):
+        if b'"action_' not in line:
+            continue
+        try:
+            event = orjson.loads(line)
+        except ValueError:
+            continue
+        if isinstance(event, dict):
+            yield event
 
 
 def with_bands(

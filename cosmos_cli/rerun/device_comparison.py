@@ -2,14 +2,17 @@
 Records of a device and of its playback: the same values and ages to the microsecond, and the same outputs.
 
 Samples that no tick could find, after the last one, are counted and not compared. Frames are compared in their order,
-values of an output by the times at which they were due, or in their order where those are the ticks' own.
+values of an output by the times at which they were due, or in their order where those are the ticks' own. What a driver
+refused, and the safe value of a profile that had run out, a recording neither refuses nor gives: by the device's events
+these are counted and not compared.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
+import re
+from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
@@ -18,14 +21,19 @@ from typing import Any, Final
 from cosmos_cli.rerun.recorded_run import FlownRun, RecordedAgent, UsedDevice
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.kinds.playback import HEAD, OUTPUT_HEAD, streams_of
+from madns_runtime.plain_values import is_real
 from madns_runtime.recording.reader import read_stream
+from madns_runtime.recording.records import EVENTS
 
 SAME_TIME_S: Final = 1.5e-6
 """Times are recorded in whole microseconds."""
 SAME_DUE_S: Final = 2e-4
 """Times at which values were due are by the clock of the device's process in real time, which agrees with the agent's so far."""
 SAME_AGE_US: Final = 1
+REFUSED_WITHIN_S: Final = 1.0
+"""A driver refuses what was due so long before at most."""
 Row = Sequence[Any]
+Pair = tuple[Row | None, Row | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +58,7 @@ class ChannelComparison:
     different: int
     """Compared records that differ, and those that only one run has."""
     left_out: int
-    """Records after the agent's last tick, and outputs of after it: no rerun has them."""
+    """Records after the agent's last tick, and outputs of after it, or that were refused, or safe: no rerun has them."""
     in_ticks: int
     """Samples that came while a tick was under way: it may have found them, or the next one did as in the rerun."""
     first: FirstDifference | None = None
@@ -106,17 +114,21 @@ def _compare(  # noqa: PLR0913 - both sides of one channel
                 [row for row in rows if row[0] <= agent.last_s + SAME_TIME_S] for rows in (a, b)
             )
             seen = kept
-        pairs: list[tuple[Row | None, Row | None]] = _in_order(seen, b)
+        pairs: list[Pair] = _in_order(seen, b)
         is_same, left_out = _is_same_input, len(kept) - len(seen)
     else:
         # Before time zero only lockstep records what is put out.
         a, b = ([row for row in rows if row[0] >= 0.0] for rows in (a, b))
-        pairs = _in_order(a, b) if channel.is_frame else _by_time(a, b)
+        refused_s, safe_s = _told_times(used.folder, channel)
+        in_time = sum(row[0] <= agent.last_s for row in a)
+        kept_b = _without_refused(a[:in_time], b, refused_s) if channel.is_frame else b
+        pairs = _in_order(a, kept_b) if channel.is_frame else _by_time(a, b)
+        explained = _leave_out_explained(pairs, refused_s, safe_s) + len(b) - len(kept_b)
         # What was put out after the last step of lockstep has no partner, at the end.
         whole = len(pairs)
         while pairs and pairs[-1][1] is None and (pairs[-1][0] or (0.0,))[0] > agent.last_s:
             pairs.pop()
-        is_same, left_out = _is_same_output, whole - len(pairs)
+        is_same, left_out = _is_same_output, whole - len(pairs) + explained
     if is_early:
         _leave_out_after(pairs, agent, is_input=channel.direction == "in")
     differing = [pair for pair in pairs if None in pair or not is_same(*pair)]
@@ -133,9 +145,82 @@ def _compare(  # noqa: PLR0913 - both sides of one channel
     )
 
 
-def _leave_out_after(
-    pairs: list[tuple[Row | None, Row | None]], agent: RecordedAgent, *, is_input: bool
-) -> None:
+def _told_times(folder: Path, channel: Channel) -> tuple[list[float], list[float]]:
+    """Return when a device's events tell that values for an output were refused, and that its profile had run out, s."""
+    refused = re.compile(rf"(?:[^\s:]+: )?{re.escape(channel.name)}: ")
+    times: tuple[list[float], list[float]] = ([], [])
+    for event in _rows(folder / f"{EVENTS.name}.jsonl"):
+        told: Mapping[str, Any] = event if isinstance(event, Mapping) else {}
+        t_s = told.get("t_s")
+        if not is_real(t_s):
+            continue
+        if told.get("event") == "refused" and refused.match(str(told.get("why"))):
+            times[0].append(t_s)
+        elif told.get("event") == "underrun" and told.get("channel") == channel.name:
+            times[1].append(t_s)
+    return times
+
+
+def _without_refused(a: Sequence[Row], b: Sequence[Row], refused_s: Sequence[float]) -> list[Row]:
+    """
+    Return the frames of the rerun without those that the recorded device refused.
+
+    Of several that were due at one time the first one goes that is not what is on record in its place.
+    """
+    kept = list(b)
+    for at_s in sorted(refused_s):
+        if len(kept) <= len(a):
+            break
+        last = bisect_right(kept, at_s + SAME_DUE_S, key=itemgetter(0)) - 1
+        if last < 0 or not _is_refused(kept[last], at_s):
+            continue
+        first = bisect_left(kept, kept[last][0] - SAME_DUE_S, key=itemgetter(0))
+        others = (
+            place
+            for place in range(first, last + 1)
+            if place >= len(a) or not _is_same_output(a[place], kept[place])
+        )
+        del kept[next(others, last)]
+    return kept
+
+
+def _is_refused(row: Row, at_s: float) -> bool:
+    """Tell whether a value may be that which was refused at some time."""
+    return bool(-SAME_DUE_S <= at_s - row[0] <= REFUSED_WITHIN_S)
+
+
+def _is_safe(row: Row, at_s: float) -> bool:
+    """Tell whether a value may be the safe one of a profile that had run out at some time: it is put out right then."""
+    done_s = row[0] + row[1] * 1e-6
+    return bool(row[0] - SAME_DUE_S <= at_s <= done_s + 2.0 * SAME_TIME_S)
+
+
+def _leave_out_explained(
+    pairs: list[Pair], refused_s: Sequence[float], safe_s: Sequence[float]
+) -> int:
+    """Leave out what one run alone has, by the recorded device's events; return how many."""
+    ways: tuple[tuple[int, Sequence[float], Callable[[Row, float], bool]], ...] = (
+        (0, safe_s, _is_safe),
+        (1, refused_s, _is_refused),
+    )
+    gone: set[int] = set()
+    for side, times_s, fits in ways:
+        alone = {
+            place: row
+            for place, pair in enumerate(pairs if times_s else ())
+            if pair[1 - side] is None and (row := pair[side]) is not None
+        }
+        for at_s in times_s:
+            fitting = [place for place, row in alone.items() if fits(row, at_s)]
+            if fitting:
+                place = max(fitting, key=lambda each: alone[each][0])
+                gone.add(place)
+                del alone[place]
+    pairs[:] = [pair for place, pair in enumerate(pairs) if place not in gone]
+    return len(gone)
+
+
+def _leave_out_after(pairs: list[Pair], agent: RecordedAgent, *, is_input: bool) -> None:
     """Leave out the last rows that the rerun alone has, of after an agent's last tick on record."""
     while pairs and pairs[-1][0] is None and (row := pairs[-1][1]) is not None:
         handed_s = row[0] + row[2] * 1e-6 if is_input else row[0]
@@ -159,7 +244,7 @@ def _rows(path: Path) -> list[Row]:
     return list(read_stream(path).records()) if path.is_file() else []
 
 
-def _in_order(a: Sequence[Row], b: Sequence[Row]) -> list[tuple[Row | None, Row | None]]:
+def _in_order(a: Sequence[Row], b: Sequence[Row]) -> list[Pair]:
     longest = max(len(a), len(b))
     return [
         (a[place] if place < len(a) else None, b[place] if place < len(b) else None)
@@ -167,13 +252,13 @@ def _in_order(a: Sequence[Row], b: Sequence[Row]) -> list[tuple[Row | None, Row 
     ]
 
 
-def _by_time(a: Sequence[Row], b: Sequence[Row]) -> list[tuple[Row | None, Row | None]]:
+def _by_time(a: Sequence[Row], b: Sequence[Row]) -> list[Pair]:
     """
     Pair what was due at the same time, as far as clocks agree, several of one time in their order.
 
     In their order all that mostly was not: then each tick wrote in its own time.
     """
-    pairs: list[tuple[Row | None, Row | None]] = []
+    pairs: list[Pair] = []
     left, right = (deque(sorted(rows, key=itemgetter(0))) for rows in (a, b))
     while left and right:
         later_s = left[0][0] - right[0][0]
@@ -193,7 +278,7 @@ def _is_same_output(a: Any, b: Any) -> bool:
     return list(a[len(OUTPUT_HEAD) :]) == list(b[len(OUTPUT_HEAD) :])
 
 
-def _told(pair: tuple[Row | None, Row | None], channel: Channel) -> FirstDifference:
+def _told(pair: Pair, channel: Channel) -> FirstDifference:
     a, b = pair
     row: Row = a if a is not None else b if b is not None else (0.0,)
     if a is None or b is None:

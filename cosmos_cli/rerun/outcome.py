@@ -78,10 +78,21 @@ class RerunOutcome:
         ]
 
     @property
-    def is_same(self) -> bool:
-        """Whether all that is compared is the same."""
+    def has_compared(self) -> bool:
+        """Whether there was anything to be compared: records of the simulation or of devices, or checks."""
+        judged = (one for one in self.streams.streams if not self._is_unlike(one.table))
         return (
-            not self.differing_channels
+            any(one.rows_a or one.rows_b for one in judged)
+            or any(each.compared for each in self.devices if self.is_judged(each))
+            or bool(self.expectations or self.alone)
+        )
+
+    @property
+    def is_same(self) -> bool:
+        """Whether all that is compared is the same; nothing is never the same."""
+        return (
+            self.has_compared
+            and not self.differing_channels
             and not self.differing
             and not self.differing_expectations
             and not self.alone
@@ -197,6 +208,8 @@ def verdict_of(found: RerunOutcome) -> str:
     )
     if found.is_same:
         return f"SAME: {both}"
+    if not found.has_compared:
+        return "NOTHING COMPARED: neither run has a record that is judged"
     names = [each.name for each in found.differing_channels]
     names += [one.table for one in found.differing] + found.alone
     names += [f"check {each.name}" for each in found.differing_expectations]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from madns_runtime.conditions.condition import Condition
 from madns_runtime.written_times import later_s
 
@@ -37,10 +39,12 @@ class ConditionEvaluator:
         condition = self.condition
         if self.is_met or not condition.is_at(t_s):
             return None
-        if not condition.bounds.holds(value):
-            self._since_s = None
-            return None
         at_s = 0.0 if t_s is None else t_s
+        if not condition.bounds.holds(value):
+            # Until this record the one before it was the newest: it may have held for long enough, with nobody looking.
+            met_s = self.look(math.nextafter(at_s, -math.inf))
+            self._since_s = None
+            return met_s
         if self._since_s is None:
             self._since_s = at_s
         self.count += 1

@@ -12,6 +12,10 @@ from madns_runtime.conditions.evaluator import ConditionEvaluator
 
 Take = Callable[[Any], None]
 """Takes one record in its stream's shape: a sequence in the order of its fields, or a mapping."""
+Read = Callable[[str], Any]
+"""Reads a field of one record by its name."""
+When = Callable[[Read], float | None]
+"""Returns the simulated time that a record tells, s; None or not finite where it tells none."""
 Report = Callable[[int, str, float], None]
 """Takes the number of a condition that is met, whose record it is, and the simulated time of it, s."""
 
@@ -68,6 +72,7 @@ class ConditionTap:
         stream: str,
         fields: Sequence[str],
         earlier: Callable[[], Iterable[Mapping[str, Any]]] = tuple,
+        seconds: str = "",
     ) -> Take | None:
         """
         Return what is to be given every record of a stream; None if no condition names it.
@@ -76,33 +81,38 @@ class ConditionTap:
             stream: Its name.
             fields: Of its records, in their order.
             earlier: Returns the records of earlier incarnations, by field; called if a condition counts them.
+            seconds: The first of the fields that is a float in s: where there is neither t_s nor a tick it tells, to
+                conditions that count records of some times alone, when a record is of.
         """
         own = self._by_stream.get(stream)
         if not own:
             return None
         places = {name: place for place, name in enumerate(fields)}
-        when = self._time_of(fields)
+        when, window = (
+            self._time_of(fields),
+            _Window(self._judged_by(fields, seconds), self._present_s),
+        )
         has_agents = self._source == HOST and AGENT in places
         evaluators: dict[str, list[ConditionEvaluator]] = {}
         # Of a stream that names agents, too, all records are the host's half's own.
         whole = self._evaluators(
             self._source, [each for each in own if not has_agents or HOST in each.agents]
         )
-        self._recall(whole, when, earlier)
+        self._recall(whole, window, earlier)
 
         def take(record: Any) -> None:
             if isinstance(record, Mapping):
-                read: Callable[[str], Any] = record.get
+                read: Read = record.get
             else:
                 read = lambda name: record[places[name]] if name in places else None  # noqa: E731 - one of two
-            t_s = when(read)
-            self._give(self._source, whole, t_s, read)
+            times = self._own_or_present_s(when(read)), window.of(read)
+            self._give(self._source, whole, times, read)
             if has_agents:
                 who = str(read(AGENT))
                 if (following := evaluators.get(who)) is None:
                     named = [each for each in own if who in each.agents and who != HOST]
                     following = evaluators[who] = self._evaluators(who, named)
-                self._give(who, following, t_s, read)
+                self._give(who, following, times, read)
 
         return take
 
@@ -119,7 +129,7 @@ class ConditionTap:
     def _recall(
         self,
         evaluators: Sequence[ConditionEvaluator],
-        when: Callable[[Callable[[str], Any]], float | None],
+        window: _Window,
         earlier: Callable[[], Iterable[Mapping[str, Any]]],
     ) -> None:
         counting = [each for each in evaluators if each.wants_earlier]
@@ -128,7 +138,7 @@ class ConditionTap:
             each.count = self._counted.get(each.condition.number, 0)
         counting = [each for each in counting if each.condition.number not in self._counted]
         for record in earlier() if counting else ():
-            t_s = when(record.get)
+            t_s = window.of(record.get)
             for each in counting:
                 field = each.condition.field
                 each.recall(t_s, record.get(field) if field else 1.0)
@@ -139,22 +149,21 @@ class ConditionTap:
         self,
         who: str,
         following: Sequence[ConditionEvaluator],
-        t_s: float | None,
-        read: Callable[[str], Any],
+        times: tuple[float | None, float | None],
+        read: Read,
     ) -> None:
-        is_timeless = t_s is not None and not math.isfinite(t_s)
+        t_s, judged_s = times
         for evaluator in following:
             condition = evaluator.condition
             value = read(condition.field) if condition.field else 1.0
-            # On record such a time is null, which counts as 0 where a condition, and who judges the run, looks at times.
-            own_s = (None if condition.is_timed else self._present_s()) if is_timeless else t_s
+            own_s = judged_s if condition.is_timed else t_s
             self._note(who, evaluator, evaluator.take(own_s, value))
 
     def _note(self, who: str, evaluator: ConditionEvaluator, met_s: float | None) -> None:
         if met_s is not None:
             self._report(evaluator.condition.number, who, met_s)
 
-    def _time_of(self, fields: Sequence[str]) -> Callable[[Callable[[str], Any]], float | None]:
+    def _time_of(self, fields: Sequence[str]) -> When:
         """Return what reads a record's simulated time: from its field t_s, its tick, or the clock."""
         if TIME in fields:
             return lambda read: _seconds(read(TIME))
@@ -162,9 +171,41 @@ class ConditionTap:
             return lambda read: _seconds(read(TICK), self._tick_hz)
         return lambda read: self._present_s()
 
+    def _judged_by(self, fields: Sequence[str], seconds: str) -> When:
+        """Return what reads the time by which whoever judges the run tells which records count: of some, that they were sent at."""
+        has_own = TIME in fields or (TICK in fields and self._source != HOST)
+        if has_own or not seconds:
+            return self._time_of(fields)
+        return lambda read: _seconds(read(seconds))
+
+    def _own_or_present_s(self, t_s: float | None) -> float | None:
+        """Return a record's time; the present of one that tells none, or one that is null on record."""
+        return t_s if t_s is not None and math.isfinite(t_s) else self._present_s()
+
     def _present_s(self) -> float | None:
         now_s = self._now_s()
         return None if now_s is None else max(now_s, 0.0)
+
+
+class _Window:
+    """
+    The times by which it is told which records of a stream count, as they are judged after the run.
+
+    A record that tells none is of the begin; behind one that does, it is of the present, as the next one is.
+    """
+
+    def __init__(self, when: When, present_s: Callable[[], float | None]) -> None:
+        self._when = when
+        self._present_s = present_s
+        self._has_told = False
+
+    def of(self, read: Read) -> float | None:
+        """Return the time of the next record, s; None for that of the begin."""
+        t_s = self._when(read)
+        if t_s is None or not math.isfinite(t_s):
+            return self._present_s() if self._has_told else None
+        self._has_told = True
+        return max(t_s, 0.0)
 
 
 def _seconds(value: Any, per_s: float = 1.0) -> float | None:

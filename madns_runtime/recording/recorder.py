@@ -36,8 +36,9 @@ class StreamTap(Protocol):
         stream: str,
         fields: Sequence[str],
         earlier: Callable[[], Iterable[Mapping[str, Any]]],
+        seconds: str = "",
     ) -> Callable[[Sequence[Any] | Mapping[str, Any]], None] | None:
-        """Return what is to be given every record of a stream with these fields; None if it is not looked at."""
+        """Return what is to be given every record of a stream with these fields, of which *seconds* is the first float in s; None if it is not looked at."""
 
 
 class Recorder:
@@ -85,7 +86,8 @@ class Recorder:
         file = self._streams[schema.name] = self._files.create_stream(schema)
         if self._tap is not None:
             names = [field.name for field in schema.fields]
-            take = self._tap.open(schema.name, names, partial(self._files.earlier_records, file))
+            earlier = partial(self._files.earlier_records, file)
+            take = self._tap.open(schema.name, names, earlier, schema.seconds)
             if take is not None:
                 file.tap_with(take)
 

@@ -43,6 +43,12 @@ class StreamSchema:
     fields: tuple[Field, ...]
     shape: Literal["array", "object"] = "array"
 
+    @property
+    def seconds(self) -> str:
+        """Name of the first float in seconds: the time of a record that has neither t_s nor a tick; empty without."""
+        found = (field.name for field in self.fields if (field.unit, field.kind) == ("s", "float"))
+        return next(found, "")
+
     def header(self, *, run: str, source: str, t0_utc: str | None) -> dict[str, Any]:
         """
         Return line 1 of the file.

@@ -13,6 +13,8 @@ NAME_PATTERN: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 CONTROL_KEYS: Final = ("end", "t0_utc")
 COLUMNS_TAKEN: Final = ("incarnation",)
 """Names of columns that tables add to each record."""
+DETAILS: Final = "details"
+"""Name of the column that tables add to records that are objects: what these hold beside their fields."""
 TABLES_TAKEN: Final = ("host_", "machine_")
 """Beginnings of the names of other tables than those of agents' streams."""
 DIGITS_MAX: Final = 15
@@ -50,8 +52,8 @@ def check_schema(schema: StreamSchema) -> None:
     Check that a stream of this schema can be a file that is read back.
 
     Raises:
-        PluginError: Its name is no file name, it has no fields, two of one name, one of no such kind, or some that
-            are rounded among others that are no numbers.
+        PluginError: Its name is no file name, it has no fields, two of one name, one of no such kind, some that
+            are rounded among others that are no numbers, or one that bears the name of what tables add.
     """
     check_name(schema.name)
     fields: tuple[Any, ...] = schema.fields  # of a plug-in
@@ -82,6 +84,11 @@ def check_schema(schema: StreamSchema) -> None:
         )
     if schema.shape == "object" and len(names) == 1 and names[0] in CONTROL_KEYS:
         raise PluginError(f"stream {schema.name}: a single field may not be named {names[0]}")
+    if schema.shape == "object" and DETAILS in names:
+        raise PluginError(
+            f"stream {schema.name}: records that are objects have no field {DETAILS}: tables keep in a column of that"
+            " name what they hold beside their fields; choose another name"
+        )
 
 
 def _is_kind(kind: Any) -> bool:

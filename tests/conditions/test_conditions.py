@@ -66,6 +66,15 @@ def test_a_condition_that_has_to_hold_for_a_while_begins_anew_when_it_does_not()
     assert evaluator.look(6.0) is None
 
 
+def test_a_condition_has_held_until_the_record_with_which_it_does_not_any_more():
+    evaluator = ConditionEvaluator(condition(for_s=0.5))
+
+    assert [evaluator.take(t, v) for t, v in ((1.0, 11), (1.5, 5), (2.0, 11))] == [None] * 3
+    assert evaluator.look(2.0) is None
+    assert evaluator.take(3.0, 5) == 2.5
+    assert evaluator.take(4.0, 11) is None
+
+
 def test_a_while_that_is_no_binary_number_is_over_at_its_tick():
     evaluator = ConditionEvaluator(condition(for_s=0.2))
 
@@ -134,6 +143,36 @@ def test_a_record_whose_time_is_none_is_of_the_present_and_where_times_count_of_
     assert told == [(0, "a", 99.0)]
     tap.look(104.0)
     assert told == [(0, "a", 99.0), (2, "a", 104.0)]
+
+
+@pytest.mark.parametrize("nothing", [None, math.nan])
+def test_a_record_that_tells_no_time_behind_one_that_does_is_of_the_present_for_all(nothing):
+    early, late = condition(number=1, to_s=50.0), condition(number=2, from_s=50.0)
+    lasting = condition(number=3, for_s=5.0)
+    tap, told = tapped((early, late, lasting))
+    take = tap.open("drive", ("t_s", "speed_m_s"))
+
+    take((98.0, 1.0))
+    take((nothing, 11.0))
+    tap.look(103.9)
+    assert told == [(2, "a", 99.0)]
+    tap.look(104.0)
+
+    assert told == [(2, "a", 99.0), (3, "a", 104.0)]
+
+
+def test_records_count_by_the_time_that_they_are_judged_by(tmp_path):
+    calls = StreamSchema("calls", (Field("sent_s", "s"), Field("range_km", "km")))
+    given = {"stream": "calls", "field": "range_km"}
+    early, late = condition(number=1, to_s=50.0, **given), condition(number=2, from_s=50.0, **given)
+    tap, told = tapped((early, late, condition(number=3, **given)))
+    recorder = Recorder(RecordFiles(tmp_path, run="0001-test", source="a"), Recording(), tap=tap)
+    recorder.open_stream(calls)
+
+    recorder.record("calls", (40.0, 11.0))
+    recorder.close()
+
+    assert told == [(1, "a", 40.0), (3, "a", 99.0)]
 
 
 def test_a_hosts_records_that_name_agents_are_followed_agent_by_agent():

@@ -178,6 +178,17 @@ def test_single_field_that_reads_as_another_kind_of_line_is_refused(tmp_path):
         make_recorder(tmp_path).open_stream(schema)
 
 
+def test_an_object_has_no_field_of_the_name_under_which_tables_keep_what_stands_beside(tmp_path):
+    fields = (Field("t_s", "s"), Field("details", "", "json"))
+    RecordFiles(tmp_path, run="r", source="a").create_stream(StreamSchema("rows", fields))
+
+    with pytest.raises(PluginError, match="have no field details.*choose another name"):
+        RecordFiles(tmp_path, run="r", source="a").create_stream(
+            StreamSchema("contacts", fields, shape="object")
+        )
+    assert not (tmp_path / "contacts.jsonl").exists()
+
+
 def test_directory_that_cannot_be_made_is_the_machines_fault(tmp_path):
     (tmp_path / "file").write_text("")
 

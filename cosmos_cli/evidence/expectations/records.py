@@ -15,9 +15,9 @@ from cosmos_cli.evidence.streams import NUMBER_KINDS
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST, TIME
 from madns_runtime.recording.records import HEALTH, Field
+from madns_runtime.recording.stream_rules import DETAILS
 
 BATCH_RECORDS = 65_536
-DETAILS = "details"
 TABLE_NAMES = (
     ("agent", ""),
     (HOST, f"{HOST}_"),

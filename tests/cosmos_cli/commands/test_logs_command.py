@@ -24,6 +24,7 @@ from cosmos_cli.evidence import run_log
 from cosmos_cli.evidence.run_directory import RunDirectory, begin_run
 from cosmos_cli.evidence.run_log import LogReading
 from cosmos_cli.fleet.connection import ConnectOptions
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.onboard import log_tail
 from cosmos_cli.onboard.request_loop import VerbRequest
 
@@ -417,6 +418,67 @@ def test_surprise_at_a_machine_is_its_failure_and_all_else_is_told(elsewhere, ca
     assert code == 3
     assert "pi01: its log cannot be read: unexpected ZeroDivisionError" in told.err
     assert "host 5" in told.out
+
+
+def fails_first(*failures):
+    """Return what asks a machine: it fails so often, then tells one line and that the run has ended."""
+    coming = list(failures)
+    text = record(8, "info", "back again")
+    told = {"files": {"agents/a3/log.jsonl": {"start": 0, "end": len(text), "text": text}}}
+
+    def ask(self, source, offsets, *, is_following):
+        if coming:
+            raise coming.pop(0)
+        self._stop.wait(0.2)  # who would not wait for it has ended by then
+        ended = {**told, "living": False, "more": False}
+        self._answers.put(log_follower._Answered(source.machine, told=ended))
+
+    return ask
+
+
+@pytest.fixture
+def hosted(elsewhere, monkeypatch):
+    """The same, with the host on that machine, which is asked again at once."""
+    plan = json.loads((elsewhere / "plan.json").read_text())
+    plan["host"] = {"target": plan["machines"]["pi01"]["target"]}
+    (elsewhere / "plan.json").write_text(json.dumps(plan))
+    monkeypatch.setattr(log_follower, "AGAIN_S", 0.0)
+    monkeypatch.setattr(log_follower, "LOOK_INTERVAL_S", 0.0)
+    return elsewhere
+
+
+AWAY = [MachineFailure(kind, "away") for kind in (FailureKind.LOST, FailureKind.REFUSED)]
+
+
+def test_the_hosts_machine_is_followed_again_when_it_is_back(hosted, capsys, monkeypatch):
+    monkeypatch.setattr(log_follower.LogFollower, "_ask_connected", fails_first(*AWAY))
+
+    code = cosmos(["logs", "--follow"])
+    told = capsys.readouterr()
+
+    assert "back again" in told.out
+    assert told.err.count("pi01: its log cannot be read: away") == 1
+    assert code == 0
+
+
+@pytest.mark.parametrize(
+    ("failure", "absence_s"),
+    [(AWAY[0], 0.0), (MachineFailure(FailureKind.AUTHENTICATION, "away"), 60.0)],
+)
+def test_the_hosts_machine_is_not_waited_for_without_end(
+    hosted, capsys, monkeypatch, failure, absence_s
+):
+    monkeypatch.setattr(log_follower, "ABSENCE_S", absence_s)
+    monkeypatch.setattr(log_follower, "AGAIN_S", 60.0)
+    monkeypatch.setattr(log_follower.LogFollower, "_ask_connected", fails_first(failure))
+
+    code = cosmos(["logs", "--follow"])
+    told = capsys.readouterr()
+
+    assert code == 3
+    assert "back again" not in told.out
+    assert "has ended" not in told.err
+    assert "0001-x: pi01, its host's machine, gives no answer" in told.err
 
 
 class AnswersAtOnce(SimpleQueue):

@@ -454,3 +454,55 @@ def test_a_field_that_one_life_alone_has_is_null_in_the_lines_of_the_other(make,
     assert code == 0
     assert (fields["a_m"]["max"], fields["a_m"]["compared"]) == (3.0, 6)
     assert (fields["b_m"]["different"], fields["b_m"]["compared"]) == (0, 3)
+
+
+def record_contacts(made, *, end_s=9.0):
+    """Record objects whose first value bears the name of what else a line may be."""
+    fields = (Field("end", "s"), Field("t0_utc", "", "str"), Field("t_s", "s"))
+    recorder = made.recorder(
+        "agents/agent-01", "agent-01", StreamSchema("contacts", fields, shape="object")
+    )
+    recorder.record("contacts", {"end": end_s, "t0_utc": "", "t_s": 1.0})
+    recorder.record("contacts", {"t0_utc": "", "end": 2.0 * end_s, "t_s": 2.0})
+    recorder.close()
+
+
+def test_objects_that_begin_like_another_kind_of_line_are_compared(make, capsys):
+    make(record_contacts), make(lambda made: record_contacts(made, end_s=8.0))
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    contacts = streams_of(document)["contacts"]
+    assert code == 1
+    assert contacts["rows"] == [2, 2]
+    assert contacts["fields"]["end"]["different"] == 2
+    assert not contacts["identical"]
+
+
+def record_calls(made, *rows):
+    fields = (Field("t_s", "s"), *(Field(n, "", "str") for n in ("sender", "receiver")))
+    schema = StreamSchema("calls", (*fields, Field("kind", "", "str")))
+    recorder = made.recorder("agents/agent-01", "agent-01", schema)
+    for row in rows:
+        recorder.record("calls", row)
+    recorder.close()
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [(("x", None, "call"), (None, "x", "call")), (("x", "a b", "c"), ("x", "a", "b c"))],
+)
+def test_records_about_others_are_no_pairs_though_their_words_are_the_same_in_a_row(
+    make, capsys, a, b
+):
+    (
+        make(lambda made: record_calls(made, (1.0, *a))),
+        make(lambda made: record_calls(made, (1.0, *b))),
+    )
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    calls = streams_of(document)["calls"]
+    assert code == 1
+    assert (calls["matched"], calls["only_a"]["count"], calls["only_b"]["count"]) == (0, 1, 1)
+    assert calls["only_a"]["first"]["who"] == "agent-01 " + " ".join(filter(None, a))

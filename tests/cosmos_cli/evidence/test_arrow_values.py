@@ -83,6 +83,8 @@ def test_a_run_imports_nothing_that_computes_with_arrow_or_masks(tmp_path):
         (np.array([1, -(2**63)]), "int", [1, -(2**63)]),
         (np.array([1, 2], np.int32), "int", [1, 2]),
         (np.array([1.0, np.nan, 0.5, 2.0**63, -np.inf]), "int", [1, None, None, None, None]),
+        (np.array([None, -(2**63), 2**63 - 1], object), "int", [None, -(2**63), 2**63 - 1]),
+        (np.array([-(2.0**63), 2.0**63, 0.5, -(2.0**64)]), "int", [-(2**63), None, None, None]),
         (np.arange(11) % 3 == 0, "bool", [i % 3 == 0 for i in range(11)]),
         (np.array([], np.float64), "float", []),
         (np.array([], np.bool_), "bool", []),

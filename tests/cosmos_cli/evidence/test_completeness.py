@@ -4,11 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
-from harness.synthetic_run import SyntheticRun
+from harness.synthetic_run import MACHINE, SyntheticRun
 
+from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.evidence.completeness import ExpectedRecords, find_missing
+from cosmos_cli.evidence.run_directory import write_json
 from cosmos_cli.evidence.streams import find_streams, scan_stream
 from cosmos_cli.evidence.tabulate import gather
+from madns_runtime.recording.records import EVENTS, Field, StreamSchema
 
 
 def missing(made: SyntheticRun, **of_first_agent) -> list[str]:
@@ -33,6 +36,33 @@ def test_life_that_left_nothing_is_missing_when_a_later_one_recorded(tmp_path, f
 
     (line,) = missing(made)
     assert line.startswith(f"{name}: no records of incarnation 1")
+
+
+@pytest.mark.parametrize("is_in_lockstep", [True, False])
+def test_a_stream_of_which_a_devices_account_tells_and_that_is_gone_is_missing(
+    tmp_path, is_in_lockstep
+):
+    made = SyntheticRun(tmp_path).write()
+    plan = made.run.read_json(made.run.plan_json) or {}
+    write_json(made.run.plan_json, {**plan, "devices": {MACHINE: ["agent-01/imu"]}})
+    gyro = StreamSchema("gyro", (Field("t_s", "s"), Field("gyro", "rad/s")))
+    recorder = made.recorder("devices/agent-01/imu", "agent-01/imu", gyro, EVENTS)
+    recorder.start()
+    account = {"status": "ok", "frozen": {}, "records": recorder.close().to_mapping()}
+    account |= {"samples": 0, "errors": 0, "stale_ratio": 0.0, "lost": 0, "restarts": 0}
+    result = made.result()
+    if is_in_lockstep:
+        result["agents"]["agent-01"]["records"]["devices"] = {"imu": account}
+    else:
+        report = json.dumps({"agent-01/imu": {**account, "records": None, "report": account}})
+        (made.run.path / "machines" / MACHINE / "devices.json").write_text(report)
+    whole = finish_run(made.run, result, made.expected, has_report=False).missing
+    (made.run.path / "devices/agent-01/imu/gyro.jsonl").unlink()
+    made.run.manifest_json.unlink()
+
+    cut = finish_run(made.run, result, made.expected, has_report=False).missing
+
+    assert (whole, cut) == ((), ("agent-01/imu: gyro is missing",))
 
 
 def test_machine_that_runs_no_agent_owes_no_records(tmp_path):

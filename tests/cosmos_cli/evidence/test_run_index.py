@@ -27,6 +27,14 @@ def test_run_is_found_from_another_folder(tmp_path: Path, which: str) -> None:
     assert find_run(Path("runs"), which) == run
 
 
+def test_a_run_that_cannot_be_looked_at_is_passed_over_and_not_forgotten(tmp_path: Path) -> None:
+    run = create_run(tmp_path / "runs", "x")
+    remember_run("0002-x", tmp_path / ("a" * 300))  # which no file system tells of
+
+    assert remembered_runs() == [run.path]
+    assert len(list(index_directory().iterdir())) == 2
+
+
 def test_folder_that_was_named_is_meant_alone(tmp_path: Path) -> None:
     create_run(tmp_path / "runs", "x")
 

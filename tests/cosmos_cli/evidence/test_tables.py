@@ -139,6 +139,19 @@ def test_large_integers_are_exact_where_others_of_the_field_are_null(tmp_path, m
     assert found.faults == ()
 
 
+@pytest.mark.parametrize("kind", ["packed", "str"])
+def test_a_tick_that_is_no_number_tells_no_time(tmp_path, kind):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("odd", (Field("tick", "", kind), Field("n", "", "int")))
+    record(made, "agent-01", schema, [("dawn", 1), ("dusk", 2)])
+
+    gather(made.run, 10.0, quiet)
+
+    table = pq.read_table(made.run.tables / "odd.parquet").to_pydict()
+    assert table["n"] == [1, 2]
+    assert "t_s" not in table
+
+
 def test_a_value_that_is_nested_too_deep_is_null_and_reported(tmp_path):
     made = SyntheticRun(tmp_path)
     schema = StreamSchema("odd", (Field("extra", "", "json"),))
@@ -222,6 +235,19 @@ def test_details_of_events_are_kept(tmp_path):
     details = table.read("host", ("event", "details"))
     assert details["event"].tolist() == ["SIMULATION_START"]
     assert details["details"].tolist() == ['{"why":"all"}']
+
+
+def test_a_field_of_an_earlier_run_that_is_called_details_keeps_its_values(tmp_path):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("contacts", (Field("t_s", "s"), Field("notes")), shape="object")
+    record(made, "agent-01", schema, [{"t_s": 1.0, "notes": 2.5}, {"t_s": 2.0, "notes": 3.5}])
+    path = made.stream("agent-01", "contacts")
+    path.write_bytes(path.read_bytes().replace(b"notes", b"details"))
+
+    gather(made.run, 10.0, quiet)
+
+    table = pq.read_table(made.run.tables / "contacts.parquet").to_pydict()
+    assert table["details"] == ["2.5", "3.5"]
 
 
 def test_stream_without_records_becomes_an_empty_table(tmp_path):

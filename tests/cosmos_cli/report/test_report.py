@@ -8,6 +8,7 @@ import pytest
 from harness.synthetic_run import RECORDING, STATE, T0_UTC, SyntheticRun, make_config
 
 from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.evidence.run_directory import write_json
 from cosmos_cli.report.build import MACHINE_CHAPTERS, build_sections, figures_of
 from cosmos_cli.report.cells import format_cell, format_measured
 from cosmos_cli.report.html import encode_array, render_page
@@ -689,3 +690,22 @@ def test_packets_and_lost_of_a_foreign_summary_are_no_packets(tmp_path):
 )
 def test_what_was_measured_is_told_apart_from_its_limit(got, limit, text):
     assert format_measured(got, limit) == text
+
+
+def test_expectations_and_agents_that_are_too_many_to_be_drawn_are_told(tmp_path):
+    made = SyntheticRun(tmp_path, make_config(22, ticks=4)).write()
+    given = {"words": "below 1", "stream": "ticks", "field": "lateness_us", "statistic": "max"}
+    given |= {"agents": list(made.names), "bounds": {"high": 1.0}, "unit": "us"}
+    checks = [{**given, "name": f"low-{number}"} for number in range(14)]
+    plan = made.run.read_json(made.run.plan_json)
+    write_json(made.run.plan_json, {**plan, "expectations": checks})
+    summary = finish_run(made.run, made.result(), made.expected, has_report=False)
+
+    sections = build_sections(made.run, summary.document)
+
+    (section,) = [one for one in sections if one.title == "Expectations"]
+    figures = [block for block in section.blocks if isinstance(block, Figure)]
+    (remark,) = [block.text for block in section.blocks if isinstance(block, ReportRemark)]
+    assert [figure.title for figure in figures] == [f"low-{n}: below 1" for n in range(12)]
+    assert figures[0].note == "The first 20 of 22, the one that is told before the others."
+    assert remark == "Not drawn: low-12: below 1; low-13: below 1."

@@ -217,6 +217,12 @@ def test_events_that_are_no_file_are_not_waited_for(tmp_path, make):
     assert read_actions(SimpleNamespace(path=tmp_path)) == []
 
 
+def test_actions_are_told_however_many_other_events_there_are(tmp_path):
+    others = [{"t_s": 0.0, "event": "sync_deadline_broken"}] * 50_001
+
+    assert [each.number for each in read_actions(a_run(tmp_path, [*others, *EVENTS]))] == [0, 1, 2]
+
+
 def test_event_whose_number_is_none_is_no_action(tmp_path):
     garbled = EVENTS[1] | {"number": [0]}
 

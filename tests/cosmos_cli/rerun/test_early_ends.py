@@ -6,6 +6,7 @@ import pytest
 from harness.synthetic_run import SyntheticRun
 
 from cosmos_cli.collect.finish import finish_run
+from cosmos_cli.diff.compare import Comparison
 from cosmos_cli.diff.fields import RecordPlace
 from cosmos_cli.diff.stream import Alone, StreamDifference
 from cosmos_cli.errors import InputError
@@ -17,6 +18,7 @@ from cosmos_cli.rerun.early_ends import (
     leave_out_after_simulated_time,
     leave_out_unwritten,
 )
+from cosmos_cli.rerun.outcome import RerunOutcome, verdict_of
 from cosmos_cli.rerun.recorded_run import FlownRun, RecordedAgent, UsedDevice, read_recorded_run
 from cosmos_cli.rerun.scenario import make_rerun
 from madns_runtime.config import Agents, Recording, RunConfig, TimeSettings
@@ -37,6 +39,19 @@ def stream(source, *, by="tick", first, count=1):
         rows_b=34 + count,
         only_b=Alone(count=count, first=place, last=place),
     )
+
+
+def test_a_rerun_with_nothing_to_judge_is_not_the_same():
+    counted = StreamDifference(table="round_trips", source="a", rows_a=20, rows_b=20, matched=20)
+    compared = Comparison(a=None, b=None, streams=[counted])
+    outcomes = [
+        RerunOutcome(devices=(), streams=compared, remarks=(), unlike=unlike)
+        for unlike in ((), ("round_trips",))
+    ]
+
+    assert [found.is_same for found in outcomes] == [True, False]
+    assert verdict_of(outcomes[0]).startswith("SAME: 0 records of 0 channels of devices, 20")
+    assert verdict_of(outcomes[1]).startswith("NOTHING COMPARED")
 
 
 def test_agents_that_ended_before_the_last_one_are_known_with_their_times():

@@ -11,7 +11,7 @@ from cosmos_cli.rerun.recorded_run import FlownRun, RecordedAgent, UsedDevice
 from madns_runtime.config import Agents, Recording, RunConfig, TimeSettings
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
-from madns_runtime.recording.records import Field, StreamSchema
+from madns_runtime.recording.records import EVENTS, Field, StreamSchema
 
 DRIVER = """
 from madns_runtime.hardware.contract import Channel, DeviceKind, Sample, SimulatedDevice
@@ -98,6 +98,13 @@ agents: {count: 1, tick_hz: 10}
 time: {mode: lockstep, duration_s: 1}
 hardware: {armed: true, devices: [{name: pulser, kind: "./pulser.py:Pulser"}]}
 """
+FRAME = StreamSchema(
+    "pulse",
+    (
+        *(Field("t_s", "s"), Field("lateness_us", "us", "int")),
+        *(Field("bytes", "B", "int"), Field("data", "", "str")),
+    ),
+)
 PULSE = StreamSchema(
     "pulse", (Field("t_s", "s"), Field("lateness_us", "us", "int"), Field("pulse", "s"))
 )
@@ -120,14 +127,17 @@ def test_a_queue_of_values_of_one_tick_is_the_same_again(tmp_path):
     assert done.returncode == 0
 
 
-def compared(tmp_path, recorded, rerun):
-    """Return what the comparison of an output's values finds, (time in s, value) each."""
+def compared(tmp_path, recorded, rerun, *, events=(), schema=PULSE):
+    """Return what the comparison of an output's values finds, (time in s, value) each, and *events* of the device on record."""
     for folder, rows in (("devices", recorded), ("rerun/devices", rerun)):
         files = RecordFiles(tmp_path / folder / "a/dev", run="r", source="a/dev")
         recorder = Recorder(files, Recording())
-        recorder.open_stream(PULSE)
-        for t_s, value in rows:
-            recorder.record("pulse", (t_s, 0, value))
+        recorder.open_stream(schema)
+        recorder.open_stream(EVENTS)
+        for t_s, *values in rows:
+            recorder.record("pulse", (t_s, 100, *values))
+        for t_s, event, values in events if folder == "devices" else ():
+            recorder.record("events", {"t_s": t_s, "utc": "", "event": event, **values})
         recorder.start()
         recorder.close()
     used = UsedDevice(
@@ -180,3 +190,69 @@ def test_what_another_clock_put_out_a_moment_off_its_time_finds_that_of_its_time
     missing = compared(tmp_path / "missing", [*recorded[:8], *recorded[9:]], rerun)
     assert (missing.compared, missing.different) == (17, 1)
     assert missing.first.text == "only in the rerun"
+
+
+def refused(t_s, why="pulse: the bus is full"):
+    return (t_s, "refused", {"why": why})
+
+
+def frames(*told):
+    return [(t_s, len(data) // 2, data) for t_s, data in told]
+
+
+FRAMES = frames((0.1, "aa"), (0.2, "bb"), (0.2, "cc"), (0.2, "dd"), (0.3, "ee"))
+
+
+@pytest.mark.parametrize("gone", [0, 1, 2, 3, 4])
+def test_a_frame_that_the_driver_refused_is_no_difference(tmp_path, gone):
+    at_s = FRAMES[gone][0] + 0.0003
+    recorded = FRAMES[:gone] + FRAMES[gone + 1 :]
+
+    found = compared(tmp_path, recorded, FRAMES, events=[refused(at_s)], schema=FRAME)
+    others = [refused(at_s, "other: the bus is full"), refused(0.09), refused(None)]
+    told = compared(tmp_path / "told", recorded, FRAMES, events=others, schema=FRAME)
+
+    assert (found.compared, found.different, found.left_out) == (4, 0, 1)
+    assert told.different > 0
+
+
+def test_a_frame_that_was_refused_is_no_difference_where_others_came_after_the_last_tick(tmp_path):
+    found = compared(
+        tmp_path,
+        [*FRAMES[1:], *frames((0.9001, "ff"), (0.9002, "00"))],
+        FRAMES,
+        events=[refused(0.1003)],
+        schema=FRAME,
+    )
+
+    assert (found.compared, found.different, found.left_out) == (4, 0, 3)
+
+
+def test_a_frame_of_todays_software_is_a_difference_beside_one_that_was_refused(tmp_path):
+    recorded = frames((0.1, "aa"), (0.3, "ee"))
+    rerun = frames((0.1, "ab"), (0.2, "bb"), (0.3, "ee"))
+
+    found = compared(tmp_path, recorded, rerun, events=[refused(0.2003)], schema=FRAME)
+
+    assert (found.compared, found.different, found.left_out) == (2, 1, 1)
+
+
+def test_a_value_that_the_driver_refused_is_no_difference(tmp_path):
+    rerun = [(0.1 * k, float(k)) for k in range(1, 8)]
+    recorded = [*rerun[:3], *rerun[4:]]
+
+    found = compared(tmp_path, recorded, rerun, events=[refused(0.4003, "a: pulse: too long")])
+
+    assert (found.compared, found.different, found.left_out) == (6, 0, 1)
+
+
+def test_the_safe_value_of_a_profile_that_had_run_out_is_no_difference(tmp_path):
+    rerun = [(0.1, 1.0), (0.2, 2.0), (0.5, 5.0)]
+    recorded = [*rerun[:2], (0.3, 0.0), rerun[2]]
+    ran_out = (0.30009, "underrun", {"channel": "pulse"})
+
+    found = compared(tmp_path, recorded, rerun, events=[ran_out])
+    told = compared(tmp_path / "told", recorded, rerun, events=[(0.2, *ran_out[1:])])
+
+    assert (found.compared, found.different, found.left_out) == (3, 0, 1)
+    assert (told.compared, told.different) == (4, 1)
