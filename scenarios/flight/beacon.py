@@ -43,10 +43,10 @@ class Beacon(FlightSoftware):
     def step(self, t_s: float, readings: Readings) -> None:
         """Speak when it is time to."""
         if t_s >= self._next_beacon_s:
-            self._next_beacon_s += self._beacon_s
+            self._next_beacon_s = following_s(self._next_beacon_s, self._beacon_s, t_s)
             self.context.broadcast({"beacon": self.context.satellite})
         if t_s >= self._next_status_s:
-            self._next_status_s += self._status_s
+            self._next_status_s = following_s(self._next_status_s, self._status_s, t_s)
             self.context.send(GROUND, self._status(t_s))
             self.context.estimate({"neighbours": float(self._neighbours(t_s))})
 
@@ -74,3 +74,8 @@ class Beacon(FlightSoftware):
 
     def _status(self, t_s: float) -> dict[str, Any]:
         return {"satellite": self.context.satellite, "neighbours": self._neighbours(t_s)}
+
+
+def following_s(due_s: float, period_s: float, now_s: float) -> float:
+    """Return when something is due again; a satellite that was away does not make up for what it left out."""
+    return due_s + period_s if due_s + period_s > now_s else now_s + period_s

@@ -278,6 +278,10 @@ def test_faults_of_a_rings_settings_are_named():
         RingSettings.from_mapping(SLOTS | {"exchange_s": 0})
     with pytest.raises(ValueError, match="spacing_deg: expected > 0 and <= 360, got 0"):
         RingSettings.from_mapping(SLOTS | {"spacing_deg": 0})
+    # What judges slots takes a text for no spacing: they would be all around for it.
+    for given in ("2", True, [2.0]):
+        with pytest.raises(ValueError, match="spacing_deg: expected a number, got"):
+            RingSettings.from_mapping(SLOTS | {"spacing_deg": given})
     context = SimpleNamespace(settings=SLOTS | {"spacing_deg": 100}, index=0, agents=tuple("abcd"))
     with pytest.raises(ValueError, match="expected at most 90 for 4 agents, got 100"):
         RingMember(context, follows_sma=False)

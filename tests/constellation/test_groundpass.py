@@ -1,6 +1,7 @@
 """The shipped scenario of ground passes, its first minutes: flight software, host and stations together."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -9,6 +10,7 @@ from constellation_fakes import Star, carry
 from cosmos_cli.models.document import read_document
 from cosmos_cli.models.yaml_source import read_source
 from madns_runtime.config import from_mapping
+from madns_runtime.simulations.constellation.flight.loading import load_flight_class
 from madns_runtime.simulations.constellation.parameters import (
     ConstellationParameters,
     Crosslinks,
@@ -113,6 +115,21 @@ def test_beacons_reach_neighbours_and_nothing_is_unaccounted(star):
     )
     assert sum(vehicle["flight"]["vehicles_heard"] for vehicle in vehicles.values()) > 20
     assert sum(vehicle["messages_late"] for vehicle in vehicles.values()) == 0
+
+
+def test_a_beacon_that_was_away_makes_up_for_nothing():
+    said, settings = [], {"status_s": 60, "beacon_s": 30}
+    context = SimpleNamespace(settings=settings, index=1, agents=("a", "b"), satellite="B")
+    context.send = context.broadcast = lambda *message: said.append(message)
+    context.estimate = lambda values: None
+    beacon = load_flight_class("flight/beacon.py:Beacon", SCENARIO.parent)()
+    beacon.setup(context)
+
+    for t_s in range(1000, 1120):
+        beacon.step(float(t_s), {})
+
+    to_ground = [message for message in said if message[0] == "ground"]
+    assert (len(said) - len(to_ground), len(to_ground)) == (4, 2)
 
 
 def test_who_spoke_to_nobody_is_told(star):

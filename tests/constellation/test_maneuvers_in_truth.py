@@ -441,6 +441,22 @@ def test_energy_is_judged_between_maneuvers_and_not_across_them(fly):
     assert len({round(row[2]) for row in rows}) >= 3
 
 
+@pytest.mark.parametrize("thrust", [{}, {"thrust_n": 500.0}])
+def test_energy_is_compared_anew_after_a_burn_that_was_commanded_last_and_flown_first(fly, thrust):
+    # By tick 150 truth with the burn at 22 s was handed out and judged; that at 18 s comes before it.
+    star = fly(
+        ["agent-02 10 rtn 21 0 1 0", "agent-02 150 rtn 3 0 1 0"],
+        vehicle={"thruster": {**THRUSTER, **thrust}},
+    )
+
+    star.run(60.0)
+
+    summary = star.host.finish()
+    assert summary["maneuvers"]["executed"] == 2
+    assert summary["energy_drift_max"] < 1e-12
+    assert summary["checks"][0]["passed"] is True
+
+
 def test_drag_is_not_judged_by_energy_and_a_smaller_area_loses_less(fly):
     propagator = {"kind": "scipy", "forces": ["two_body", "j2", "drag"]}
     star = fly(

@@ -129,6 +129,13 @@ def test_times_are_equal_and_a_late_call_makes_up_for_nothing():
             ],
             "expected one spacing_deg in all settings with slots: even, got 2, None",
         ),
+        *(
+            (
+                {"software": "f.py:F", "settings": {"slots": "even", "spacing_deg": given}},
+                f"expected a number of degrees as spacing_deg in settings with slots: even, got {given!r}",
+            )
+            for given in ([2.0, 3.0], "2", True)
+        ),
     ],
 )
 def test_record_of_slots_that_nobody_has_is_refused(tmp_path, flight, expected):

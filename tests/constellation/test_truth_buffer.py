@@ -62,6 +62,20 @@ def test_truth_after_a_hole_is_served_again():
     assert buffer.underruns == 1
 
 
+def test_of_joints_that_differ_by_rounding_the_last_one_holds():
+    # Two impulses for one time, which flight software has worked out on two ways.
+    first_s, second_s = 7.0 - 2.0**-50, 7.0
+    buffer = TruthBuffer()
+    buffer.add(straight(0.0))
+    buffer.add(straight(first_s, revision=1, speed=7001.0))
+    buffer.add(straight(second_s, revision=2, speed=7003.0))
+
+    assert buffer.lookup(6.9)[3] == 7000.0
+    assert buffer.given_m_s(6.9)[0] == 0.0
+    assert buffer.lookup(second_s)[3] == 7003.0
+    assert buffer.given_m_s(second_s)[0] == 3.0
+
+
 def test_segments_may_come_in_any_order():
     buffer = TruthBuffer()
     for t0_s in (20.0, 0.0, 10.0):

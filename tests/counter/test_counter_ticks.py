@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.counter.agent import CounterAgent
 from madns_runtime.simulations.counter.answer_times import PENDING_MAX, AnswerTimes
 from madns_runtime.simulations.counter.host import CounterHost
@@ -15,32 +16,36 @@ AGENTS = ("a", "b")
 class World:
     """Both halves with nothing between them; messages arrive at once."""
 
-    def __init__(self, **parameters):
+    def __init__(self, of_agents=None, **parameters):
         self.now = 0.0
         self.records = []
+        self.services = []
         self.sent = 0
         chosen = CounterParameters(**parameters)
+        self.own = dict.fromkeys(AGENTS, chosen) | (of_agents or {})
         self.host = CounterHost()
         self.host.setup(self._context(chosen, self._to_agent))
         self.agents = {name: CounterAgent() for name in AGENTS}
         for name, agent in self.agents.items():
-            agent.setup(self._context(chosen, self._to_host, name), {})
+            agent.setup(self._context(self.own[name], self._to_host, name), {})
 
     def _context(self, parameters, send, name="host"):
         return SimpleNamespace(
             agents=AGENTS,
             parameters=parameters,
+            agent_parameters=self.own,
             now_s=lambda: self.now,
-            send=lambda to, message, service: send(name, to, message),
+            send=lambda to, message, service: send(name, to, message, service),
             open_stream=lambda stream, fields: None,
             record=lambda stream, values: self.records.append((stream, name, *values)),
             hardware={},
         )
 
-    def _to_agent(self, name, to, message):
+    def _to_agent(self, name, to, message, service):
+        self.services.append((to, service))
         self.agents[to].receive(message)
 
-    def _to_host(self, name, to, message):
+    def _to_host(self, name, to, message, service):
         self.sent += 1
         self.host.receive(name, message)
 
@@ -98,6 +103,16 @@ def test_at_once_is_the_default_and_knows_of_no_ticks():
     assert world.host.finish() == {"returned": 20}
     assert "unread_refused" not in world.agents["a"].finish()
     assert [s.name for s in declared_streams(CounterParameters(), AGENTS)] == ["round_trips"]
+
+
+def test_each_agent_is_answered_in_the_class_of_service_of_its_own_packets():
+    own = {"b": CounterParameters(service="sync")}
+    for answer_hz in (0.0, 20.0):
+        world = World(of_agents=own, answer_hz=answer_hz)
+
+        world.play(2, 20.0)
+
+        assert set(world.services) == {("a", Service.BEST), ("b", Service.SYNC)}
 
 
 def test_host_that_was_held_up_counts_its_missed_ticks():

@@ -205,9 +205,15 @@ def _slot_faults(parameters: ConstellationParameters) -> list[str]:
             "parameters.record.slots_hz: expected flight software with settings {slots: even}, got none; "
             "drop it, or let parameters.flight say so"
         ]
-    spacings = {rule.settings.get("spacing_deg") for rule in rules}
-    if len(spacings) > 1:
-        told = ", ".join(sorted(map(str, spacings)))
+    spacings = [rule.settings.get("spacing_deg") for rule in rules]
+    for spacing in spacings:
+        if spacing is not None and type(spacing) not in (int, float):
+            return [
+                "parameters.record.slots_hz: expected a number of degrees as spacing_deg in settings with slots: even, "
+                f"got {spacing!r:.80}"
+            ]
+    if any(spacing != spacings[0] for spacing in spacings):
+        told = ", ".join(sorted({*map(str, spacings)}))
         return [
             f"parameters.record.slots_hz: expected one spacing_deg in all settings with slots: even, got {told}"
         ]

@@ -22,7 +22,9 @@ class CounterHost(HostSimulation):
     def setup(self, context: HostContext) -> None:
         """Prepare."""
         self._send = context.send
-        self._service = Service[context.parameters.service.upper()]
+        self._services = {
+            agent: Service[own.service.upper()] for agent, own in context.agent_parameters.items()
+        }
         self._returned_count = 0
         self._samples: Counter[str] = Counter()
         """Samples of a device that have come, by agent."""
@@ -70,7 +72,7 @@ class CounterHost(HostSimulation):
         if self._answer_times is not None:
             self._time_answer(agent, *newest)
             self._answer_times.answered(agent, packet, self._context.now_s())
-        self._send(agent, [packet, value + 1, payload], self._service)
+        self._send(agent, [packet, value + 1, payload], self._services[agent])
         self._returned_count += 1
 
     def _time_answer(self, agent: str, newest: int) -> None:

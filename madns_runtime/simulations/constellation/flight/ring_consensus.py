@@ -102,7 +102,7 @@ class RingSettings:
         missing = {"altitude_km", "inclination_deg"} - set(known)
         if missing:
             raise ValueError(f"flight.settings: expected {' and '.join(sorted(missing))}")
-        numbers: dict[str, Any] = {name: float(settings[name]) for name in known}
+        numbers: dict[str, Any] = {name: _number(settings, name) for name in known}
         found = cls(slots=slots, **numbers, **switches)
         if found.exchange_s <= 0.0:
             raise ValueError(f"flight.settings.exchange_s: expected > 0, got {found.exchange_s:g}")
@@ -336,6 +336,19 @@ def _switch(settings: Mapping[str, Any], name: str) -> bool:
     if not isinstance(value, bool):
         raise ValueError(f"flight.settings.{name}: expected true or false, got {value!r}")
     return value
+
+
+def _number(settings: Mapping[str, Any], name: str) -> float:
+    """
+    Return a setting that is a number.
+
+    Raises:
+        ValueError: It is something else, such as a text of digits, which whoever judges slots takes for nothing.
+    """
+    value = settings[name]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"flight.settings.{name}: expected a number, got {value!r:.80}")
+    return float(value)
 
 
 def _normal(mean: CircularElements) -> list[float]:

@@ -155,6 +155,9 @@ class Maneuvering:
         assert taken.effect is not None
         vehicle, start_s, phase_s = taken.vehicle, taken.effect.start_s, taken.command.phase_s
         if is_changed:
+            if taken.effect.kind in ("impulse", "thrust"):
+                # It may be flown before a burn by whose end energy is compared already.
+                self._refills.judge_anew(vehicle)
             self._refills.changed(vehicle, start_s, start_s + phase_s)
         self._record(taken, self._desk.measure(taken, self._context.now_s()))
         self._tell(taken)

@@ -9,6 +9,8 @@ from datetime import datetime
 
 FIRST_YEAR = 1957
 """Of the first satellite: no epoch lies before it, and two-digit years turn over there."""
+LAST_YEAR = 2200
+"""No epoch lies so far ahead: sidereal time and the Sun's place are series about J2000."""
 NUMBERS = {
     "MEAN_MOTION": (1e-3, 20.0),
     "ECCENTRICITY": (0.0, 0.9999),

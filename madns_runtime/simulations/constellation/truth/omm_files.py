@@ -7,11 +7,12 @@ import io
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from datetime import MAXYEAR, UTC, datetime
+from datetime import UTC, datetime
 
 from madns_runtime.plain_values import shown
 from madns_runtime.simulations.constellation.truth.element_set import (
     FIRST_YEAR,
+    LAST_YEAR,
     NUMBERS,
     ElementSet,
     range_fault,
@@ -150,7 +151,8 @@ def _omm_set(fields: dict[str, str], at: str, faults: list[str]) -> Iterator[Ele
     epoch = _omm_epoch(fields.get("EPOCH", ""))
     if epoch is None:
         faults.append(
-            f"{at}: EPOCH: expected such as 2017-03-07T07:18:55.000000, got {shown(fields.get('EPOCH'))}"
+            f"{at}: EPOCH: expected such as 2017-03-07T07:18:55.000000, of a year from {FIRST_YEAR} to {LAST_YEAR - 1}, "
+            f"got {shown(fields.get('EPOCH'))}"
         )
     if len(faults) > before or epoch is None:
         return
@@ -166,6 +168,6 @@ def _omm_epoch(text: str) -> datetime | None:
         epoch = datetime.fromisoformat(text.strip().removesuffix("Z"))
     except ValueError:
         return None
-    if epoch.tzinfo is not None or not FIRST_YEAR <= epoch.year < MAXYEAR:
+    if epoch.tzinfo is not None or not FIRST_YEAR <= epoch.year < LAST_YEAR:
         return None
     return epoch.replace(tzinfo=UTC)

@@ -25,7 +25,11 @@ from madns_runtime.simulations.constellation.parameters import (
     KeplerianSatellites,
     WalkerSatellites,
 )
-from madns_runtime.simulations.constellation.truth.element_set import FIRST_YEAR, ElementSet
+from madns_runtime.simulations.constellation.truth.element_set import (
+    FIRST_YEAR,
+    LAST_YEAR,
+    ElementSet,
+)
 from madns_runtime.simulations.constellation.truth.element_sets import (
     FAULTS_MAX,
     read_element_sets,
@@ -33,9 +37,6 @@ from madns_runtime.simulations.constellation.truth.element_sets import (
 
 EPOCH_WITHOUT_SETS = datetime(2000, 1, 1, 12, tzinfo=UTC)
 """Simulated time zero of patterns and elements for which the scenario names none: J2000, read as UTC."""
-
-LAST_YEAR = 2200
-"""No simulated time lies so far ahead: sidereal time and the Sun's place are series about J2000."""
 
 _NOTATION = re.compile(
     r"\s*([0-9]{1,3}(?:\.[0-9]{0,12})?)\s*:\s*([0-9]{1,9})\s*/\s*([0-9]{1,9})\s*/\s*([0-9]{1,9})\s*"

@@ -162,8 +162,8 @@ class TruthBuffer:
         pieces = self._pieces
         while pieces and pieces[0].end_s < t_s - TIME_EPSILON_S:
             self._leave_first()
-        # At a joint the later piece counts: it may be the one after a maneuver.
-        if len(pieces) > 1 and pieces[1].t0_s <= t_s:
+        # At a joint the later piece counts: it may be the one after a maneuver, and another joint may be as near.
+        while len(pieces) > 1 and pieces[1].t0_s <= t_s:
             self._leave_first()
         if not pieces or t_s < pieces[0].t0_s - TIME_EPSILON_S:
             self._low_s = self._high_s = math.inf
