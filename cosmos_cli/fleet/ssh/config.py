@@ -152,7 +152,8 @@ def _take(line: Line, query: _Query) -> None:
 def _applies(line: Line, query: _Query) -> bool:
     words = _split(line)
     if line.keyword == "host":
-        return matches(words, (query.is_final and query.first("hostname")) or query.host)
+        name = (query.first("hostname") or query.host).lower() if query.is_final else query.host
+        return matches_exactly(words, name)
     is_match = True
     while words:
         criterion = words.pop(0).lower()
@@ -194,18 +195,24 @@ def _match_exec(command: str, query: _Query) -> bool:
 _CRITERIA: dict[str, Callable[[str, _Query], bool]] = {
     "host": lambda text, query: matches(text.split(","), query.first("hostname") or query.host),
     "originalhost": lambda text, query: matches(text.split(","), query.host),
-    "user": lambda text, query: matches(text.split(","), query.first("user") or local_user()),
-    "localuser": lambda text, query: matches(text.split(","), local_user()),
+    "user": lambda text, query: matches_exactly(
+        text.split(","), query.first("user") or local_user()
+    ),
+    "localuser": lambda text, query: matches_exactly(text.split(","), local_user()),
     "exec": _match_exec,
 }
 
 
 def matches(patterns: Sequence[str], name: str) -> bool:
+    """Tell whether a host's name, which has no case, fits a list of patterns as `matches_exactly`."""
+    return matches_exactly([pattern.lower() for pattern in patterns], name.lower())
+
+
+def matches_exactly(patterns: Sequence[str], name: str) -> bool:
     """Tell whether a name fits a list of OpenSSH's patterns: * and ?, and ! for what must not fit."""
-    name = name.lower()
-    if any(_fits(pattern[1:].lower(), name) for pattern in patterns if pattern.startswith("!")):
+    if any(_fits(pattern[1:], name) for pattern in patterns if pattern.startswith("!")):
         return False
-    return any(_fits(pattern.lower(), name) for pattern in patterns if pattern[:1] != "!")
+    return any(_fits(pattern, name) for pattern in patterns if pattern[:1] != "!")
 
 
 def _fits(pattern: str, name: str) -> bool:
