@@ -140,9 +140,11 @@ class SshConfig:
 
 
 def _take(line: Line, query: _Query) -> None:
-    values = query.found.setdefault(line.keyword, [])
     words = [line.value] if line.keyword in WHOLE_LINES else _split(line)
     value = shlex.join(words) if line.keyword in LISTS else " ".join(words)
+    if line.keyword == "connecttimeout" and value.lower() == "none":
+        return  # as in ssh, where it says nothing, and what stands below counts
+    values = query.found.setdefault(line.keyword, [])
     if line.keyword == "hostname":
         value = _expanded(value, {"h": query.host})
     if not values or (line.keyword in REPEATED and value not in values):
