@@ -58,6 +58,8 @@ WITH_TOKENS = (
 )
 
 _LINE = re.compile(r"\s*([A-Za-z0-9]+)(?:\s*=\s*|\s+)(.*?)\s*")
+_PIECE = re.compile(r"""\"(?:\\[\\"']|[^"])*+\"|'(?:\\[\\"']|[^'])*+'|\\[\\"' ]|[^"' \t]""")
+_WORD = re.compile(rf"(?:{_PIECE.pattern})++(?=[ \t]|$)")
 _TOKEN = re.compile(r"%(.)")
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
 
@@ -275,8 +277,23 @@ def _split(line: Line) -> list[str]:
 
 @functools.lru_cache(maxsize=1024)
 def _words(text: str) -> tuple[str, ...]:
-    """Return a line's words; each machine of a fleet asks for the same lines."""
-    return tuple(shlex.split(text, comments=True))
+    """Return a line's words as OpenSSH's argv_split makes them; each machine of a fleet asks for the same lines."""
+    words, rest = [], text.strip(" \t")
+    while rest and not rest.startswith("#"):  # within a word it begins no comment
+        word = _WORD.match(rest)
+        if word is None:
+            raise ValueError("No closing quotation")
+        words.append(_PIECE.sub(_unquoted, word[0]))
+        rest = rest[word.end() :].lstrip(" \t")
+    return tuple(words)
+
+
+def _unquoted(piece: re.Match[str]) -> str:
+    text = piece[0]
+    quote = text[0] if len(text) > 1 and text[0] in "\"'" else ""
+    escaped = "\\\"'" if quote else "\\\"' "
+    inner = text[1:-1] if quote else text
+    return re.sub(rf"\\([{re.escape(escaped)}])", r"\1", inner)
 
 
 def read_config(files: Sequence[Path]) -> SshConfig:

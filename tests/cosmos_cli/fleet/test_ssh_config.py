@@ -255,3 +255,18 @@ def test_same_as_ssh_itself_says(config, host, text):
     assert theirs["user"] == ours["user"]
     assert theirs["port"] == ours.get("port", "22")
     assert theirs.get("proxyjump") == ours.get("proxyjump")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "value", ["a#b", "a #b", r"a\b", r"a\\b", r"a\ b", r'"a b"c', r'"a\"b"', "'a#b' # c", r'"a\ b"']
+)
+def test_words_are_those_of_ssh_itself(config, value):
+    if shutil.which("ssh") is None:
+        pytest.skip("needs OpenSSH's ssh")
+    file = config(f"User {value}\n")
+    said = subprocess.run(
+        ["ssh", "-G", "-F", str(file), "pi"], capture_output=True, text=True, check=True
+    ).stdout
+
+    assert f"user {lookup(file, 'pi')['user']}\n" in said
