@@ -24,6 +24,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.ssh import connect as attempts_module
 from cosmos_cli.fleet.ssh import connection as connection_module
+from cosmos_cli.fleet.ssh.link_local import address_as_seen
 from cosmos_cli.fleet.ssh.transport import SshTransport
 from cosmos_cli.fleet.target import Target
 
@@ -699,6 +700,31 @@ def test_nagles_delay_is_off(known):
         assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == 1
     finally:
         connection.close()
+
+
+@pytest.mark.parametrize(
+    ("own", "said", "expected"),
+    [
+        ("fe80::a", "fe80::a%eth0 48732 fe80::1%eth0 22\n", "fe80::a%eth0"),
+        ("fe80::a", "a greeting\nfe80::a%wlan0.1 1 fe80::1%wlan0.1 22\n", "fe80::a%wlan0.1"),
+        ("fe80::a", "fe80::b%eth0 48732 fe80::1%eth0 22\n", "fe80::a"),
+        ("fe80::a", "fe80::a%$(reboot) 48732 fe80::1%eth0 22\n", "fe80::a"),
+        ("fe80::a", "\n", "fe80::a"),
+        ("fe80::a", None, "fe80::a"),
+        ("fd00::a", "fd00::a%eth0 48732 fd00::1 22\n", "fd00::a"),
+        ("10.0.0.1", "", "10.0.0.1"),
+        ("", "", ""),
+    ],
+)
+def test_link_local_address_of_this_computer_is_as_the_machine_sees_it(own, said, expected):
+    """Without the machine's interface no program there can connect to it."""
+
+    def run(command, **limits):
+        if said is None:
+            raise MachineFailure(FailureKind.LOST, "cut")
+        return SimpleNamespace(stdout=said.encode())
+
+    assert address_as_seen(own, run) == expected
 
 
 def test_addresses_are_those_of_both_ends(known):
