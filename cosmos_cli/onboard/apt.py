@@ -260,7 +260,7 @@ def _update(
 
 
 def _configure(deadlines: AptDeadlines) -> Iterator[AnswerPart]:
-    status, output = yield from _running(["dpkg", "--configure", "-a"], deadlines)
+    status, output = yield from _unlocked(["dpkg", "--configure", "-a"], deadlines)
     if status:
         trouble = trouble_of(output)
         text = f"an earlier installation was interrupted and cannot be finished: {trouble.text}"
@@ -268,9 +268,13 @@ def _configure(deadlines: AptDeadlines) -> Iterator[AnswerPart]:
 
 
 def _apt(words: Sequence[str], deadlines: AptDeadlines) -> Running:
-    """Run apt-get, again and again while another program holds its lock."""
+    return (yield from _unlocked([_apt_get(), *OPTIONS, *words], deadlines))
+
+
+def _unlocked(command: Sequence[str], deadlines: AptDeadlines) -> Running:
+    """Run a command, again and again while another program holds the package manager's lock."""
     while True:
-        status, output = yield from _running([_apt_get(), *OPTIONS, *words], deadlines)
+        status, output = yield from _running(command, deadlines)
         is_locked = status != 0 and trouble_of(output).word == "locked"
         if not is_locked or time.monotonic() > deadlines.lock_s:
             return status, output

@@ -50,7 +50,7 @@ PYTHON_HINT = (
 _TROUBLES = (
     (
         "locked",
-        re.compile(r"Could not get lock|Unable to acquire the dpkg"),
+        re.compile(r"Could not get lock|is another process using it|was locked by another process"),
         "another program works on packages there",
         "wait for its end, then repeat; a board often updates itself after it was started",
     ),

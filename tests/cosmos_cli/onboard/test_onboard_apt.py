@@ -134,7 +134,12 @@ case $action in
     upgrade) for file in "$PACKAGES"/*; do echo 2.0 > "$file"; done ;;
 esac
 """
-DPKG = '#!/bin/sh\necho "dpkg $*" >> "$PACKAGES/../asked"\n'
+DPKG = r"""#!/bin/sh
+echo "dpkg $*" >> "$PACKAGES/../asked"
+if [ -f "$PACKAGES/../say-dpkg" ]; then
+    cat "$PACKAGES/../say-dpkg"; rm "$PACKAGES/../say-dpkg"; exit 2
+fi
+"""
 
 Packages = Callable[..., dict[str, Any]]
 
@@ -276,6 +281,23 @@ def test_check_renews_lists_of_its_own_where_the_real_one_would_renew_the_system
         "simulated install foo beside",
     ]
     assert not (apt.folder / "packages" / "foo").exists()
+
+
+@pytest.mark.process
+def test_lock_is_waited_for_where_an_installation_is_finished(
+    apt: PlayedApt, packages: Packages
+) -> None:
+    """As where the machine updates itself after a power failure."""
+    apt.says_once("install", "interrupted")
+    (apt.folder / "say-dpkg").write_text(
+        "dpkg: error: dpkg frontend lock was locked by another process with pid 869\n"
+        "Note: removing the lock file is always wrong, can damage the locked area\n"
+    )
+
+    result = packages("install", "foo")
+
+    assert [change["name"] for change in result["changes"]] == ["foo"]
+    assert apt.asked().count("dpkg --configure -a") == 2
 
 
 @pytest.mark.process
