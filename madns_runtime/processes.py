@@ -89,7 +89,10 @@ def state_directory() -> Path:
     if own:
         return Path(own) / "processes"
     shared = os.environ.get("XDG_STATE_HOME")
-    base = Path(shared) if shared else Path(os.path.expanduser("~")) / ".local/state"
+    home = os.path.expanduser("~")
+    if home == "~":  # as of a number for which nobody stands; containers give such a one this home
+        home = "/"
+    base = Path(shared) if shared else Path(home) / ".local/state"
     return base / "cosmos/processes"
 
 

@@ -19,6 +19,7 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     SomeInventoryOption,
     failure_teller,
+    where_words,
 )
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
@@ -120,7 +121,8 @@ def down(
         for line in _lines(one):
             console.data(line)
     if not chosen:
-        console.say("no run lives on this machine" + _unasked_words(unasked))
+        where = where_words(len(outcomes) - len(unasked))
+        console.say(f"no run lives {where}{_unasked_words(unasked)}")
     is_left = any(one.is_left for one in ended)
     exit_code = ExitCode.RUN_FAILED if is_left else ExitCode.MACHINES if bad else ExitCode.OK
     retry = offer_retry_of(console, inventory, targets, [outcome.machine for outcome in bad])

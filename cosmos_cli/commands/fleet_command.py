@@ -17,6 +17,7 @@ from cosmos_cli.fleet.target import Target
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.console import Console
+from cosmos_cli.ui.plural import counted
 
 if TYPE_CHECKING:
     from cosmos_cli.models.inventory import Machine
@@ -173,3 +174,9 @@ def finish(
     console.data(verdict)
     console.print_json({**document, "retry": retry, "exit_code": exit_code})
     return exit_code
+
+
+def where_words(answered: int) -> str:
+    """Say of which machines it is known what lives there: what nobody could ask about is left out."""
+    here = "on this machine"
+    return f"{here} and on the {counted(answered, 'machine')} that answered" if answered else here

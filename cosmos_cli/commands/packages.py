@@ -33,7 +33,7 @@ from cosmos_cli.onboard.apt_words import PYTHON_HINT
 from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
 
-PARTS = ("files", "links", "facts", "system", "apt_words", "apt")
+PARTS = ("files", "links", "facts", "scratch", "system", "apt_words", "apt")
 PIECE_TIMEOUT_S = 60.0
 """A sign of life comes each second; a slow card may hold one up."""
 TIMEOUT_S = 1800.0

@@ -18,6 +18,7 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     SomeInventoryOption,
     failure_teller,
+    where_words,
 )
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.evidence.run_directory import RunDirectory
@@ -106,7 +107,7 @@ def ps(
         console.table(COLUMNS, rows)
     bad = failed(outcomes)
     if not rows:
-        where = _where(len(outcomes) - len(bad))
+        where = where_words(len(outcomes) - len(bad))
         console.say(f"no run lives {where}" if run is None else _unknown_words(run, where, living))
     if bad:
         unasked = compact(outcome.machine for outcome in bad)
@@ -122,12 +123,6 @@ def ps(
         }
     )
     return int(exit_code)
-
-
-def _where(answered: int) -> str:
-    """Say of which machines it is known what lives there: what nobody could ask about is left out."""
-    here = "on this machine"
-    return f"{here} and on the {counted(answered, 'machine')} that answered" if answered else here
 
 
 def _unknown_words(which: str, where: str, living: Sequence[RunPart]) -> str:

@@ -43,7 +43,8 @@ def look_here(living: Sequence[str]) -> dict[str, Any]:
 
 
 def interface_of(address: str) -> str:
-    """Return the interface that has one of this computer's addresses; lo when none does."""
+    """Return the interface that has one of this computer's addresses; lo when none does. One behind % is a machine's."""
+    address = address.partition("%")[0]
     for name, addresses in psutil.net_if_addrs().items():
         if any(item.address.partition("%")[0] == address for item in addresses):
             return str(name)

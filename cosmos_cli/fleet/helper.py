@@ -29,7 +29,7 @@ from cosmos_cli.fleet.answers.verbs import BODY_BYTES_MAX, answer_shape, failure
 from cosmos_cli.fleet.connection import EXIT_STATUS_TIMEOUT_S, Connection, Stream
 from cosmos_cli.fleet.failure import EndedEarly, FailureKind, MachineFailure, runs_no_commands
 from cosmos_cli.fleet.liveness import BlockingStream, SilenceWatch, SilentMachine
-from cosmos_cli.fleet.shell import SYSTEM_PATH, for_login_shell
+from cosmos_cli.fleet.shell import NO_PYTHON_HOME, SYSTEM_PATH, for_login_shell
 from cosmos_cli.fleet.transfer_limits import Patience, duration_words
 from cosmos_cli.ui.step_times import timed
 
@@ -306,6 +306,8 @@ class Helper:
 
 
 NO_PYTHON_STATUS = 127
+TOOL_PATH = "PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin; "
+"""For what is asked there, such as conditions of commands: sysctl and i2cdetect are on nobody's path but root's."""
 
 
 def _ended_at_once(failure: MachineFailure, status: int) -> MachineFailure:
@@ -321,7 +323,7 @@ def start_command(python: str | None, package_bytes: int) -> str:
     """Return the shell command that starts the loop with the first interpreter that there is."""
     candidates = " ".join(shlex.quote(p) for p in ((python,) if python else PYTHONS))
     return for_login_shell(
-        f'{SYSTEM_PATH}for p in {candidates}; do command -v "$p" >/dev/null 2>&1 &&'
+        f'{SYSTEM_PATH}{TOOL_PATH}{NO_PYTHON_HOME}for p in {candidates}; do command -v "$p" >/dev/null 2>&1 &&'
         f' exec "$p" -I -S -c {shlex.quote(_BOOT)} {package_bytes}; done; exit {NO_PYTHON_STATUS}'
     )
 

@@ -15,7 +15,7 @@ from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.onboard.request_loop import BOOT_ID_FILE
 
-PARTS = ("madns_runtime.processes", "processes", "power")
+PARTS = ("madns_runtime.processes", "processes", "scratch", "power")
 TRY_INTERVAL_S = 1.0
 REFUSED_INTERVAL_S = 5.0
 """After a refused login: a machine that is starting refuses everybody, and sshd is slow to forgive."""

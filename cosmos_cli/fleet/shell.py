@@ -17,6 +17,8 @@ BEGIN_MARK = "cosmos: the command begins"
 FORCED_AFTER_S = 2
 SYSTEM_PATH = "case :$PATH: in *:/usr/bin:*) ;; *) PATH=$PATH:/usr/bin:/bin; export PATH;; esac; "
 """Begins a script: a start-up file may have left a PATH without the system's own programs, such as mkdir and sudo."""
+NO_PYTHON_HOME = "unset PYTHONHOME; "
+"""Begins a script that starts a Python environment's interpreter: with another Python's home it finds no module."""
 
 # $1 is the command. `read` returns at the end of standard input only; sshd and LocalConnection start each
 # command in a session, thus a process group, of its own. A subshell keeps an `exit` in the command from

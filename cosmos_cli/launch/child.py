@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from cosmos_cli.fleet.shell import SYSTEM_PATH, for_login_shell
+from cosmos_cli.fleet.shell import NO_PYTHON_HOME, SYSTEM_PATH, for_login_shell
 from cosmos_cli.launch.channel import PipeChannel
 from cosmos_cli.launch.children import GROUP_CHECK_S, KILL_WAIT_S
 from cosmos_cli.launch.machines import MachinePaths
@@ -211,7 +211,7 @@ def start_command(program: RemoteProgram, paths: MachinePaths) -> str:
     stderr = str(PurePosixPath(program.run_directory, program.stderr))
     assignments = _assignments(paths, {MARK: program.run_directory})
     script = (
-        f"{SYSTEM_PATH}mkdir -p {shlex.quote(str(PurePosixPath(program.run_directory).parent))}"
+        f"{SYSTEM_PATH}{NO_PYTHON_HOME}mkdir -p {shlex.quote(str(PurePosixPath(program.run_directory).parent))}"
         f" && umask {umask_of(program.access):03o}"
         f" && mkdir -p {shlex.quote(str(PurePosixPath(stderr).parent))}"
         f" && cd {shlex.quote(paths.root)}"
@@ -227,7 +227,7 @@ def relay_command(program: RemoteProgram, incarnation: int, paths: MachinePaths)
     directory = PurePosixPath(program.run_directory, program.stderr).parent
     relay = f"{RELAY_MODULE} {shlex.quote(str(directory))} {shlex.quote(OPERATOR_SOCKET.format(incarnation))}"
     script = (
-        f"{SYSTEM_PATH}cd {shlex.quote(paths.root)}"
+        f"{SYSTEM_PATH}{NO_PYTHON_HOME}cd {shlex.quote(paths.root)}"
         f" && exec env {_assignments(paths, {})} {shlex.quote(paths.python)} -P -m {relay}"
     )
     return for_login_shell(script)

@@ -132,7 +132,24 @@ MachinePath = Annotated[
 """A file or folder on a machine; ~ is the home of who logs in."""
 
 FileMode = Annotated[str, like(r"[0-7]{3,4}", 'an octal mode in quotes such as "0644"')]
-SystemUser = Annotated[str, like(r"[A-Za-z0-9_][A-Za-z0-9_.-]*\$?", "the name of a user or group")]
+USER_NUMBER_MAX = 2**32 - 2
+"""Of Linux; the next one leaves an owner as it is, and to give a file to those beyond is an error."""
+
+
+def _is_in_reach(text: Any) -> Any:
+    if isinstance(text, str) and text.isdecimal() and int(text) > USER_NUMBER_MAX:
+        raise ValueError(
+            f"expected the name of a user or group, or a number of at most {USER_NUMBER_MAX}"
+        )
+    return text
+
+
+SystemUser = Annotated[
+    str,
+    BeforeValidator(_is_in_reach),
+    like(r"[A-Za-z0-9_][A-Za-z0-9_.-]*\$?", "the name of a user or group"),
+]
+"""Its number does as well."""
 DEVICE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 """A folder of records bears it, and what is ordered of a device: no path, and nothing hidden."""
 DeviceName = Annotated[str, like(DEVICE_NAME.pattern, "the name of a device such as sense_hat")]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import tempfile
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from cosmos_cli.onboard.apt_words import (
 )
 from cosmos_cli.onboard.facts import DPKG_QUERY, versions_of
 from cosmos_cli.onboard.request_loop import AnswerPart, HelperRefusal, VerbRequest, verb
+from cosmos_cli.onboard.scratch import scratch_file, scratch_folder
 from cosmos_cli.onboard.system import SIGN_OF_LIFE_S, read_end, start, tool_path, wait
 
 QUERY_TIMEOUT_S = 30.0
@@ -189,7 +189,7 @@ def _foresee(
 
     Nothing here changes, and nobody needs to be root: the renewed lists are in a folder that goes.
     """
-    with tempfile.TemporaryDirectory(prefix="cosmos-apt-") as folder:
+    with scratch_folder() as folder:
         beside = _beside(folder)
         is_renewed = is_updated
         if is_updated:
@@ -260,7 +260,7 @@ def _update(
 
 
 def _configure(deadlines: AptDeadlines) -> Iterator[AnswerPart]:
-    status, output = yield from _running(["dpkg", "--configure", "-a"], deadlines)
+    status, output = yield from _unlocked(["dpkg", "--configure", "-a"], deadlines)
     if status:
         trouble = trouble_of(output)
         text = f"an earlier installation was interrupted and cannot be finished: {trouble.text}"
@@ -268,9 +268,13 @@ def _configure(deadlines: AptDeadlines) -> Iterator[AnswerPart]:
 
 
 def _apt(words: Sequence[str], deadlines: AptDeadlines) -> Running:
-    """Run apt-get, again and again while another program holds its lock."""
+    return (yield from _unlocked([_apt_get(), *OPTIONS, *words], deadlines))
+
+
+def _unlocked(command: Sequence[str], deadlines: AptDeadlines) -> Running:
+    """Run a command, again and again while another program holds the package manager's lock."""
     while True:
-        status, output = yield from _running([_apt_get(), *OPTIONS, *words], deadlines)
+        status, output = yield from _running(command, deadlines)
         is_locked = status != 0 and trouble_of(output).word == "locked"
         if not is_locked or time.monotonic() > deadlines.lock_s:
             return status, output
@@ -282,7 +286,7 @@ def _apt(words: Sequence[str], deadlines: AptDeadlines) -> Running:
 
 def _running(command: Sequence[str], deadlines: AptDeadlines) -> Running:
     """Run a command to its end, with a sign of life per second."""
-    with tempfile.TemporaryFile() as output:
+    with scratch_file() as output:
         process = start(command, output, **SILENT)
         while (status := wait(process, SIGN_OF_LIFE_S)) is None:
             said = _said(output)

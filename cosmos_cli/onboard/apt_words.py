@@ -19,8 +19,9 @@ _FULL = re.compile(r"No space left on device|have enough free space in (\S+?)\.?
 _HOLDER = re.compile(r"held by process (\d+)(?: \(([^)]+)\))?")
 _UNKNOWN = re.compile(
     r"Unable to locate package (\S+)|Package '?([^\s']+)'? has no installation candidate"
-    r"|Version '[^']+' for '([^']+)' was not found"
+    r"|Version '([^']+)' for '([^']+)' was not found"
 )
+_UNMET = re.compile(r"unmet dependencies:\n((?: .*\n?)+)")
 _NO_WAY = re.compile(
     r"Temporary failure resolving '([^']+)'|Could not resolve '([^']+)'"
     r"|Could not connect to (\S+)|[Uu]nable to connect to (\S+)|Cannot initiate the connection to (\S+)"
@@ -50,7 +51,7 @@ PYTHON_HINT = (
 _TROUBLES = (
     (
         "locked",
-        re.compile(r"Could not get lock|Unable to acquire the dpkg"),
+        re.compile(r"Could not get lock|is another process using it|was locked by another process"),
         "another program works on packages there",
         "wait for its end, then repeat; a board often updates itself after it was started",
     ),
@@ -111,9 +112,16 @@ _TROUBLES = (
     ),
     (
         "broken",
-        re.compile(r"[Uu]nmet dependencies|held (?:broken )?packages|fix-broken"),
+        re.compile(r"fix-broken"),
         "packages there do not fit together",
         "`cosmos exec --sudo -- apt-get --fix-broken install --yes` may mend it",
+    ),
+    (
+        "unmet",
+        re.compile(r"[Uu]nmet dependencies|held (?:broken )?packages"),
+        "what is asked does not fit the packages there",
+        "others that need it, or that it needs, are in the way; `cosmos exec -- apt-mark showhold` names"
+        " what is held there",
     ),
     (
         "essential",
@@ -159,8 +167,19 @@ def _full_folder(output: str) -> str:
 
 
 def _unknown_names(output: str) -> str:
-    names = [next(filter(None, match)) for match in _UNKNOWN.findall(output)]
+    names = [
+        name or candidate or f"{versioned}={version}"
+        for name, candidate, version, versioned in _UNKNOWN.findall(output)
+    ]
     return f" {', '.join(dict.fromkeys(names))}"
+
+
+def _first_unmet(output: str) -> str:
+    found = _UNMET.search(output)
+    if found is None:
+        return ""
+    lines = [" ".join(line.split()) for line in found[1].splitlines()]
+    return f" ({lines[0]}{'; and more' if lines[1:] else ''})"
 
 
 def _source(output: str) -> str:
@@ -174,6 +193,8 @@ _DETAILS: Mapping[str, Callable[[str], str]] = {
     "disk_full": _full_folder,
     "unknown": _unknown_names,
     "no_way": _source,
+    "broken": _first_unmet,
+    "unmet": _first_unmet,
 }
 """By trouble: returns its details from the output."""
 

@@ -22,6 +22,8 @@ from cosmos_cli.onboard.request_loop import PlainValue, sync_folder
 LEFT_OVER_S = 3600.0
 """A half-made thing that nobody has touched for so long has no maker any more."""
 RANDOM_BYTES = 4
+_BEGAN_S = time.clock_gettime(time.CLOCK_REALTIME) - time.clock_gettime(time.CLOCK_BOOTTIME)
+"""When the machine was started, by the wall clock as this process found it."""
 
 
 def beside(folder: str, name: str) -> str:
@@ -84,8 +86,13 @@ def remove(path: str) -> None:
 
 
 def remove_left_overs(folder: str) -> None:
-    """Remove what was left half made, or half removed, by makers that are gone."""
-    now_s = time.clock_gettime(time.CLOCK_REALTIME)
+    """
+    Remove what was left half made, or half removed, by makers that are gone.
+
+    A wall clock that is set forward meanwhile, as by a time service on a board without a clock of its own, makes
+    nothing old that this process has made.
+    """
+    now_s = _BEGAN_S + time.clock_gettime(time.CLOCK_BOOTTIME)
     for path in glob.glob(os.path.join(glob.escape(folder), f"{HIDDEN}*")):
         with contextlib.suppress(OSError):
             if now_s - os.lstat(path).st_mtime > LEFT_OVER_S:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import tempfile
 
 from cosmos_cli.onboard.processes import processes
 from cosmos_cli.onboard.request_loop import (
@@ -16,6 +15,7 @@ from cosmos_cli.onboard.request_loop import (
     read_boot_id,
     verb,
 )
+from cosmos_cli.onboard.scratch import scratch_file
 
 COMMANDS = (("reboot",), ("systemctl", "reboot"), ("shutdown", "-r", "now"))
 TOOL_FOLDERS = "/usr/sbin:/sbin:/usr/bin:/bin"
@@ -40,7 +40,7 @@ def reboot(request: VerbRequest) -> None:
     command = next((words for words in COMMANDS if shutil.which(words[0], path=path)), None)
     if command is None:
         raise HelperRefusal("unsupported", "no reboot, systemctl or shutdown there")
-    with tempfile.TemporaryFile() as output:
+    with scratch_file() as output:
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,

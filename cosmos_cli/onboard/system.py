@@ -11,7 +11,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -24,6 +23,7 @@ from cosmos_cli.onboard.request_loop import (
     last_words,
     verb,
 )
+from cosmos_cli.onboard.scratch import scratch_file
 
 TYPE_CHECKING = False  # as in `request_loop`
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def running(command: Sequence[str], *, timeout_s: float) -> Iterator[AnswerPart]
     Raises:
         Refusal: TIMEOUT; it was killed.
     """
-    with tempfile.TemporaryFile() as output:
+    with scratch_file() as output:
         process = start(command, output)
         end_s = time.monotonic() + timeout_s
         try:

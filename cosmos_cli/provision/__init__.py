@@ -21,5 +21,15 @@ STORE_PARTS = (
     "environment",
 )
 """Modules of `cosmos_cli.onboard` that a `Helper` must be started with for trees and environments."""
-HELPER_PARTS = ("files", "links", "facts", "sshd", *STORE_PARTS, "system", "apt_words", "apt")
+HELPER_PARTS = (
+    "files",
+    "links",
+    "facts",
+    "sshd",
+    *STORE_PARTS,
+    "scratch",
+    "system",
+    "apt_words",
+    "apt",
+)
 """Those for `cosmos up`; each is loaded there when it is first needed."""

@@ -104,6 +104,15 @@ def test_register_is_where_the_environment_says(monkeypatch, variables, expected
     assert str(state_directory()) == expected
 
 
+def test_register_of_who_has_no_home_is_at_none_of_the_present_folder(monkeypatch):
+    """As of a number that a container is given for a user: ~ would be a folder of that name."""
+    for name in ("COSMOS_STATE_DIR", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+
+    assert str(state_directory()) == "/.local/state/cosmos/processes"
+
+
 def test_entry_of_an_earlier_boot_is_removed(register_directory):
     entry, path = enter(register_directory, boot_id="00000000-0000-0000-0000-000000000000")
 

@@ -58,6 +58,8 @@ WITH_TOKENS = (
 )
 
 _LINE = re.compile(r"\s*([A-Za-z0-9]+)(?:\s*=\s*|\s+)(.*?)\s*")
+_PIECE = re.compile(r"""\"(?:\\[\\"']|[^"])*+\"|'(?:\\[\\"']|[^'])*+'|\\[\\"' ]|[^"' \t]""")
+_WORD = re.compile(rf"(?:{_PIECE.pattern})++(?=[ \t]|$)")
 _TOKEN = re.compile(r"%(.)")
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
 
@@ -140,9 +142,11 @@ class SshConfig:
 
 
 def _take(line: Line, query: _Query) -> None:
-    values = query.found.setdefault(line.keyword, [])
     words = [line.value] if line.keyword in WHOLE_LINES else _split(line)
     value = shlex.join(words) if line.keyword in LISTS else " ".join(words)
+    if line.keyword == "connecttimeout" and value.lower() == "none":
+        return  # as in ssh, where it says nothing, and what stands below counts
+    values = query.found.setdefault(line.keyword, [])
     if line.keyword == "hostname":
         value = _expanded(value, {"h": query.host})
     if not values or (line.keyword in REPEATED and value not in values):
@@ -152,7 +156,8 @@ def _take(line: Line, query: _Query) -> None:
 def _applies(line: Line, query: _Query) -> bool:
     words = _split(line)
     if line.keyword == "host":
-        return matches(words, (query.is_final and query.first("hostname")) or query.host)
+        name = (query.first("hostname") or query.host).lower() if query.is_final else query.host
+        return matches_exactly(words, name)
     is_match = True
     while words:
         criterion = words.pop(0).lower()
@@ -194,18 +199,24 @@ def _match_exec(command: str, query: _Query) -> bool:
 _CRITERIA: dict[str, Callable[[str, _Query], bool]] = {
     "host": lambda text, query: matches(text.split(","), query.first("hostname") or query.host),
     "originalhost": lambda text, query: matches(text.split(","), query.host),
-    "user": lambda text, query: matches(text.split(","), query.first("user") or local_user()),
-    "localuser": lambda text, query: matches(text.split(","), local_user()),
+    "user": lambda text, query: matches_exactly(
+        text.split(","), query.first("user") or local_user()
+    ),
+    "localuser": lambda text, query: matches_exactly(text.split(","), local_user()),
     "exec": _match_exec,
 }
 
 
 def matches(patterns: Sequence[str], name: str) -> bool:
+    """Tell whether a host's name, which has no case, fits a list of patterns as `matches_exactly`."""
+    return matches_exactly([pattern.lower() for pattern in patterns], name.lower())
+
+
+def matches_exactly(patterns: Sequence[str], name: str) -> bool:
     """Tell whether a name fits a list of OpenSSH's patterns: * and ?, and ! for what must not fit."""
-    name = name.lower()
-    if any(_fits(pattern[1:].lower(), name) for pattern in patterns if pattern.startswith("!")):
+    if any(_fits(pattern[1:], name) for pattern in patterns if pattern.startswith("!")):
         return False
-    return any(_fits(pattern.lower(), name) for pattern in patterns if pattern[:1] != "!")
+    return any(_fits(pattern, name) for pattern in patterns if pattern[:1] != "!")
 
 
 def _fits(pattern: str, name: str) -> bool:
@@ -266,8 +277,23 @@ def _split(line: Line) -> list[str]:
 
 @functools.lru_cache(maxsize=1024)
 def _words(text: str) -> tuple[str, ...]:
-    """Return a line's words; each machine of a fleet asks for the same lines."""
-    return tuple(shlex.split(text, comments=True))
+    """Return a line's words as OpenSSH's argv_split makes them; each machine of a fleet asks for the same lines."""
+    words, rest = [], text.strip(" \t")
+    while rest and not rest.startswith("#"):  # within a word it begins no comment
+        word = _WORD.match(rest)
+        if word is None:
+            raise ValueError("No closing quotation")
+        words.append(_PIECE.sub(_unquoted, word[0]))
+        rest = rest[word.end() :].lstrip(" \t")
+    return tuple(words)
+
+
+def _unquoted(piece: re.Match[str]) -> str:
+    text = piece[0]
+    quote = text[0] if len(text) > 1 and text[0] in "\"'" else ""
+    escaped = "\\\"'" if quote else "\\\"' "
+    inner = text[1:-1] if quote else text
+    return re.sub(rf"\\([{re.escape(escaped)}])", r"\1", inner)
 
 
 def read_config(files: Sequence[Path]) -> SshConfig:

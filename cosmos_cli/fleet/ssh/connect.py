@@ -21,6 +21,7 @@ from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.ssh.failures import opening_failure
 from cosmos_cli.fleet.ssh.known_hosts import KnownHosts
+from cosmos_cli.fleet.ssh.link_local import address_as_seen
 from cosmos_cli.fleet.ssh.settings import JUMPS_MAX, SshSettings, settings_of
 from cosmos_cli.fleet.ssh.socket import SshSocket, connect_tcp, connect_through_command
 from cosmos_cli.fleet.target import Target
@@ -81,6 +82,8 @@ def _open_once(
         wire = _wire(settings, hops, max(TIMEOUT_S_MIN, until_s - time.monotonic()))
         connection = _logged_in(target, settings, options, wire=wire, until_s=until_s)
         connection.hops = hops
+        if not hops:
+            wire.own_address = address_as_seen(wire.own_address, connection.run)
         opened.pop_all()
         return connection
 

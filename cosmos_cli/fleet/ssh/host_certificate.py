@@ -19,6 +19,8 @@ HOST_CERTIFICATE = 2
 KEY_FIELDS = {"ssh-ed25519": 1, "ssh-rsa": 2}
 """Of the public key in the certificate; those of ecdsa are 2 as well: its curve and the point."""
 
+SHA_1_SIGNATURES = ("ssh-rsa", "ssh-dss")
+"""Forms of a signature that ssh takes of no authority (CASignatureAlgorithms)."""
 YEAR_9999_S = 253_370_764_800
 """Latest time that datetime can tell; for ever is later."""
 
@@ -46,6 +48,9 @@ class HostCertificate:
             name: Host name or address, without a port, in small letters.
             now_s: Unix time.
         """
+        algorithm = Message(self.signature).get_binary().decode("ascii", "replace")
+        if algorithm in SHA_1_SIGNATURES:
+            return f"it is signed by SHA-1 ({algorithm}), which can be forged"
         if not self._is_signed():  # first: of one that is forged nothing is worth telling
             return f"its signature by a key {self.authority.kind} is not valid, or not understood"
         if self.kind != HOST_CERTIFICATE:

@@ -51,7 +51,7 @@ class SshSettings:
     names: tuple[str, ...]
     """Under which its host key is known."""
     key_files: tuple[Path, ...]
-    """Private keys that were named for it, or the usual ones."""
+    """Private keys that were named for it, or the usual ones; none where what was named is `none`."""
     are_keys_named: bool
     """False when nobody named a key: then the ssh agent's come first."""
     identities_only: bool
@@ -86,8 +86,8 @@ def settings_of(target: Target) -> SshSettings:
 
     host = value("hostname", target.address)
     port = target.port or _number(value("port", str(SSH_PORT)), "Port")
-    named = [target.key_file] if target.key_file else list(found.get("identityfile", ()))
-    named = [name for name in named if name.lower() != "none"]
+    listed = [target.key_file] if target.key_file else list(found.get("identityfile", ()))
+    named = [name for name in listed if name.lower() != "none"]
     command = value("proxycommand", "none")
     jump = "none" if _is_command_first(found) else value("proxyjump", "none")
     is_direct = jump.lower() == "none"
@@ -97,7 +97,7 @@ def settings_of(target: Target) -> SshSettings:
         port=port,
         user=target.user or value("user") or local_user(),
         names=names_of(host, port, value("hostkeyalias")),
-        key_files=tuple(map(_path, named or DEFAULT_KEYS)),
+        key_files=tuple(map(_path, named if listed else DEFAULT_KEYS)),
         are_keys_named=bool(named),
         identities_only=bool(target.key_file) or value("identitiesonly").lower() == "yes",
         agent_socket=_agent_socket(value("identityagent", "SSH_AUTH_SOCK")),

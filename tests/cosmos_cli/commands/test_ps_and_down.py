@@ -404,6 +404,22 @@ def test_down_json_names_the_machine_that_could_not_be_asked_and_why(
     assert [machine["failure"]["kind"] for machine in told["machines"]] == ["refused"]
 
 
+def test_down_of_nothing_says_of_which_machines_it_is_known(
+    start: Start, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def look(self: object, targets: Sequence[Target]) -> list[Outcome[list[Seen]]]:
+        return [Outcome(machine=target.name, value=[]) for target in targets]
+
+    monkeypatch.setattr(Fleetwide, "look", look)
+
+    code = cosmos(["down", "--all", "-i", "pi01,pi02"])
+
+    assert code == 0
+    assert capsys.readouterr().err == (
+        "no run lives on this machine and on the 2 machines that answered\n"
+    )
+
+
 def test_down_fails_when_something_is_left(
     start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

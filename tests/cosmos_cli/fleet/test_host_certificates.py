@@ -234,9 +234,9 @@ def test_same_as_ssh_itself_does(serve, authorities, known_hosts, case):
 
 @pytest.fixture
 def certificate(tmp_path, authorities):
-    def make(*words):
+    def make(*words, authority="ed25519"):
         key = make_key(tmp_path / "key", "ed25519")
-        sign(authorities["ed25519"], key, *words)
+        sign(authorities[authority], key, *words)
         text = (tmp_path / "key-cert.pub").read_text()
         return base64.b64decode(text.split()[1])
 
@@ -264,6 +264,14 @@ def test_certificate_that_was_altered_is_not_signed(certificate):
     blob = certificate("-h", "-n", "px")
 
     assert "its signature" in fault(blob.replace(b"\x00\x00\x00\x02px", b"\x00\x00\x00\x02pi"))
+
+
+@pytest.mark.parametrize(("algorithm", "counts"), [("ssh-rsa", False), ("rsa-sha2-256", True)])
+def test_authority_that_signs_by_sha_1_vouches_for_nobody(certificate, algorithm, counts):
+    """As with ssh, whose CASignatureAlgorithms hold no ssh-rsa."""
+    found = fault(certificate("-t", algorithm, "-h", "-n", "pi", authority="rsa"))
+
+    assert found == (None if counts else "it is signed by SHA-1 (ssh-rsa), which can be forged")
 
 
 @pytest.mark.parametrize("cut", [1, 40, 100, -20])

@@ -111,6 +111,25 @@ def test_helper_finds_sudo_and_a_watcher_sleep_where_the_path_lacks_them(tmp_pat
 
 
 @pytest.mark.process
+def test_another_pythons_home_is_kept_from_an_environments_interpreter(tmp_path):
+    """As a start-up file there may export it: with it no environment finds its own modules."""
+    python = tmp_path / "python3"
+    python.write_text('#!/bin/sh\necho "home ${PYTHONHOME-none}"\n')
+    python.chmod(0o755)
+    program = dataclasses.replace(PROGRAM, run_directory=f"{tmp_path}/runs/1")
+    paths = dataclasses.replace(PATHS, root=str(tmp_path), python=str(python))
+    commands = (
+        helper_command(str(python), 1),
+        start_command(program, paths),
+        relay_command(program, 1, paths),
+    )
+
+    said = [run_with_path(f"export PYTHONHOME=/other; {each}", "/usr/bin") for each in commands]
+
+    assert [done.stdout.splitlines()[-1] for done in said] == [b"home none"] * 3
+
+
+@pytest.mark.process
 def test_path_that_has_the_systems_programs_stays_as_it_is():
     done = run_with_path(watched("echo $PATH"), "/opt/mine:/usr/bin:/sbin")
 

@@ -30,6 +30,7 @@ PARTS = [
     "trees",
     "wheels",
     "environment",
+    "scratch",
     "system",
     "apt",
     "records",

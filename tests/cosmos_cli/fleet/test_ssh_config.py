@@ -218,9 +218,28 @@ Host *
 """Read twice, the second time with what the first has made of the host; some distributions ask for it of everybody."""
 
 
+CAPITALS = """
+Host A
+  Port 2200
+Host alias
+  HostName Board
+  User Pi
+Match final
+Match host BOARD user Pi
+  ProxyJump gate
+Match user pi
+  Port 2201
+Host board
+  Port 2202
+Host *
+  User Pi
+"""
+"""Names of hosts after Match have no case; those after Host, and users, have one."""
+
+
 @pytest.mark.process
-@pytest.mark.parametrize("host", ["a", "b", "c", "d"])
-@pytest.mark.parametrize("text", [CASES, FINAL])
+@pytest.mark.parametrize("host", ["a", "b", "c", "d", "A", "alias", "Board"])
+@pytest.mark.parametrize("text", [CASES, FINAL, CAPITALS])
 def test_same_as_ssh_itself_says(config, host, text):
     if shutil.which("ssh") is None:
         pytest.skip("needs OpenSSH's ssh")
@@ -232,7 +251,22 @@ def test_same_as_ssh_itself_says(config, host, text):
 
     ours = lookup(file, host)
 
-    assert theirs["hostname"] == ours.get("hostname", host)
+    assert theirs["hostname"] == ours.get("hostname", host).lower()
     assert theirs["user"] == ours["user"]
     assert theirs["port"] == ours.get("port", "22")
     assert theirs.get("proxyjump") == ours.get("proxyjump")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "value", ["a#b", "a #b", r"a\b", r"a\\b", r"a\ b", r'"a b"c', r'"a\"b"', "'a#b' # c", r'"a\ b"']
+)
+def test_words_are_those_of_ssh_itself(config, value):
+    if shutil.which("ssh") is None:
+        pytest.skip("needs OpenSSH's ssh")
+    file = config(f"User {value}\n")
+    said = subprocess.run(
+        ["ssh", "-G", "-F", str(file), "pi"], capture_output=True, text=True, check=True
+    ).stdout
+
+    assert f"user {lookup(file, 'pi')['user']}\n" in said

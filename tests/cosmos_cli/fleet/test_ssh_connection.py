@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import pytest
 from harness.ports import free_port
 from harness.waiting import wait_until
+from paramiko.ssh_exception import SSHException
 from ssh_harness import needs_sshd, target_of, write_configuration
 from sshd import Sshd, make_key, public, silent_server
 
@@ -24,6 +25,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.ssh import connect as attempts_module
 from cosmos_cli.fleet.ssh import connection as connection_module
+from cosmos_cli.fleet.ssh.link_local import address_as_seen
 from cosmos_cli.fleet.ssh.transport import SshTransport
 from cosmos_cli.fleet.target import Target
 
@@ -645,6 +647,28 @@ def test_machine_behind_a_jump_host_that_is_not_reached_is_told(known, home):
     assert "the jump host does not reach it" in caught.value.text
 
 
+@pytest.mark.parametrize(
+    ("is_alive", "kind", "told"),
+    [
+        (True, FailureKind.UNREACHABLE, "pi port 22: the jump host got no answer of it in 3 s"),
+        (False, FailureKind.FROZEN, "pi port 22: the jump host stopped answering"),
+    ],
+)
+def test_machine_that_a_jump_host_gets_no_answer_of_is_not_one_that_opens(is_alive, kind, told):
+    """As of one that is switched off: sshd there waits longer than anybody here."""
+
+    def open_channel(*arguments, **more):
+        raise SSHException("Timeout opening channel.")
+
+    transport = SimpleNamespace(open_channel=open_channel)
+    hop = SimpleNamespace(transport=transport, is_alive=lambda: is_alive)
+
+    with failing(kind) as caught:
+        connection_module.SshConnection.wire_to(hop, "pi", 22, timeout_s=3.0)
+
+    assert caught.value.text == told
+
+
 def test_jump_host_for_all_hosts_is_not_its_own(own_sshd, home):
     write_configuration(
         home / ".ssh" / "config",
@@ -699,6 +723,31 @@ def test_nagles_delay_is_off(known):
         assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == 1
     finally:
         connection.close()
+
+
+@pytest.mark.parametrize(
+    ("own", "said", "expected"),
+    [
+        ("fe80::a", "fe80::a%eth0 48732 fe80::1%eth0 22\n", "fe80::a%eth0"),
+        ("fe80::a", "a greeting\nfe80::a%wlan0.1 1 fe80::1%wlan0.1 22\n", "fe80::a%wlan0.1"),
+        ("fe80::a", "fe80::b%eth0 48732 fe80::1%eth0 22\n", "fe80::a"),
+        ("fe80::a", "fe80::a%$(reboot) 48732 fe80::1%eth0 22\n", "fe80::a"),
+        ("fe80::a", "\n", "fe80::a"),
+        ("fe80::a", None, "fe80::a"),
+        ("fd00::a", "fd00::a%eth0 48732 fd00::1 22\n", "fd00::a"),
+        ("10.0.0.1", "", "10.0.0.1"),
+        ("", "", ""),
+    ],
+)
+def test_link_local_address_of_this_computer_is_as_the_machine_sees_it(own, said, expected):
+    """Without the machine's interface no program there can connect to it."""
+
+    def run(command, **limits):
+        if said is None:
+            raise MachineFailure(FailureKind.LOST, "cut")
+        return SimpleNamespace(stdout=said.encode())
+
+    assert address_as_seen(own, run) == expected
 
 
 def test_addresses_are_those_of_both_ends(known):

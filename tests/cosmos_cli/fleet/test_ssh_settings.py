@@ -201,6 +201,22 @@ def test_connect_timeout_is_a_time_as_ssh_writes_it(configure, written, seconds)
     assert settings().connect_timeout_s == seconds
 
 
+def test_connect_timeout_that_is_none_leaves_it_to_what_stands_below(configure):
+    configure("ConnectTimeout none", "ConnectTimeout 7")
+
+    assert settings().connect_timeout_s == 7
+
+
+def test_identity_file_that_is_none_offers_no_usual_key(configure, monkeypatch):
+    monkeypatch.setenv("SSH_AUTH_SOCK", "/agent")
+    configure("IdentityFile none")
+
+    found = settings()
+
+    assert found.key_files == ()
+    assert (found.identities_only, found.agent_socket) == (False, "/agent")  # the agent's count
+
+
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("written", ["soon", "1mm", "10x", "-1", "1.5", "1" * 200 + "x", "m"])
 def test_connect_timeout_that_is_no_time_is_refused(configure, written):

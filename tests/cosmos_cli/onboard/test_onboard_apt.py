@@ -18,7 +18,7 @@ from cosmos_cli.fleet.target import Target
 from cosmos_cli.onboard.apt_words import changes_between, kept_back, planned_changes, trouble_of
 
 PATIENCE_S = 120.0
-PARTS = ("files", "links", "facts", "system", "apt_words", "apt")
+PARTS = ("files", "links", "facts", "scratch", "system", "apt_words", "apt")
 
 SAID = {
     "unknown": "Reading package lists...\nE: Unable to locate package nonexistent-foo",
@@ -40,7 +40,18 @@ SAID = {
     ),
     "unsigned": "GPG error: http://deb.example InRelease: signatures: NO_PUBKEY 0E98404D386FA1D9",
     "stale": "E: Failed to fetch http://deb.example/pool/a.deb  404  Not Found [IP: 10.0.0.1 80]",
-    "broken": "The following packages have unmet dependencies:\n foo : Depends: bar (>= 2)",
+    "broken": (
+        "You might want to run 'apt --fix-broken install' to correct these.\n"
+        "The following packages have unmet dependencies:\n foo : Depends: bar (>= 2)\n"
+        "E: Unmet dependencies. Try 'apt --fix-broken install' with no packages."
+    ),
+    "unmet": (
+        "The following packages have unmet dependencies:\n"
+        " dash : Depends: dpkg (>= 1.19.1) but it is not going to be installed\n"
+        " gzip : Depends: dpkg (>= 1.15.4) but it is not going to be installed or\n"
+        "                 install-info but it is not installable\n"
+        "E: Error, pkgProblemResolver::Resolve generated breaks, this may be caused by held packages."
+    ),
     "essential": "E: Essential packages were removed and -y was used without --allow-remove-essential.",
     "sources": "E: Malformed entry 1 in list file /etc/apt/sources.list (Suite)",
     "not_root": "E: Could not open lock file /var/lib/dpkg/lock - open (13: Permission denied)",
@@ -70,6 +81,24 @@ def test_trouble_names_whom_it_is_about() -> None:
     assert "(unattended-upgr, pid 812)" in trouble_of(SAID["locked"]).text
     assert "/var/cache/apt/archives/" in trouble_of(SAID["disk_full"]).text
     assert "Segmentation fault" in trouble_of(SAID["other"]).text
+
+
+def test_version_that_no_source_has_is_named_with_its_package() -> None:
+    trouble = trouble_of("E: Version '9' for 'hello' was not found")
+
+    assert trouble.word == "unknown"
+    assert "have no hello=9" in trouble.text
+
+
+def test_what_does_not_fit_together_is_told_and_nothing_is_mended_that_is_whole() -> None:
+    unmet, broken = trouble_of(SAID["unmet"]), trouble_of(SAID["broken"])
+
+    assert "(dash : Depends: dpkg (>= 1.19.1) but it is not going to be installed; and more)" in (
+        unmet.text
+    )
+    assert "fix-broken" not in unmet.advice
+    assert "(foo : Depends: bar (>= 2))" in broken.text
+    assert "--fix-broken install" in broken.advice
 
 
 def test_unknown_package_may_be_a_python_package() -> None:
@@ -134,7 +163,12 @@ case $action in
     upgrade) for file in "$PACKAGES"/*; do echo 2.0 > "$file"; done ;;
 esac
 """
-DPKG = '#!/bin/sh\necho "dpkg $*" >> "$PACKAGES/../asked"\n'
+DPKG = r"""#!/bin/sh
+echo "dpkg $*" >> "$PACKAGES/../asked"
+if [ -f "$PACKAGES/../say-dpkg" ]; then
+    cat "$PACKAGES/../say-dpkg"; rm "$PACKAGES/../say-dpkg"; exit 2
+fi
+"""
 
 Packages = Callable[..., dict[str, Any]]
 
@@ -248,6 +282,23 @@ def test_interrupted_installation_is_finished_first(apt: PlayedApt, packages: Pa
     assert [change["name"] for change in result["changes"]] == ["foo"]
     assert "finished an interrupted installation: dpkg --configure -a" in result["notes"]
     assert apt.asked()[1:] == ["dpkg --configure -a", "apt-get install foo"]
+
+
+@pytest.mark.process
+def test_lock_is_waited_for_where_an_installation_is_finished(
+    apt: PlayedApt, packages: Packages
+) -> None:
+    """As where the machine updates itself after a power failure."""
+    apt.says_once("install", "interrupted")
+    (apt.folder / "say-dpkg").write_text(
+        "dpkg: error: dpkg frontend lock was locked by another process with pid 869\n"
+        "Note: removing the lock file is always wrong, can damage the locked area\n"
+    )
+
+    result = packages("install", "foo")
+
+    assert [change["name"] for change in result["changes"]] == ["foo"]
+    assert apt.asked().count("dpkg --configure -a") == 2
 
 
 @pytest.mark.process

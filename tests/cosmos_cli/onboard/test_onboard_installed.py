@@ -73,3 +73,22 @@ def test_what_nobody_asks_for_and_is_removed_meanwhile_is_no_error(
     told = ask(folders)
 
     assert told["prunable"]["wheels"] == []
+
+
+def test_clock_that_is_set_forward_makes_nothing_old(tmp_path, monkeypatch):
+    """As by the first answer of a time service, on a board without a clock of its own."""
+    sent, left = tmp_path / ".blobs", tmp_path / ".left"
+    sent.mkdir()
+    left.mkdir()
+    long_ago_s = content_changes.LEFT_OVER_S + 60
+    os.utime(left, (left.stat().st_mtime - long_ago_s,) * 2)
+    step_s = 86_400 * 365
+    true_clock = content_changes.time.clock_gettime
+
+    def stepped(clock):
+        return true_clock(clock) + (step_s if clock == content_changes.time.CLOCK_REALTIME else 0)
+
+    monkeypatch.setattr(content_changes.time, "clock_gettime", stepped)
+    content_changes.remove_left_overs(str(tmp_path))
+
+    assert os.listdir(tmp_path) == [".blobs"]

@@ -205,6 +205,17 @@ def test_long_command_gives_signs_of_life(tmp_path, monkeypatch):
 
 
 @pytest.mark.process
+def test_condition_of_a_command_finds_the_programs_that_the_command_finds(tmp_path, monkeypatch):
+    """Such as sysctl and i2cdetect, which are on nobody's path but root's."""
+    monkeypatch.setenv("PATH", os.defpath)
+    unless = "case :$PATH: in *:/usr/sbin:*) ;; *) exit 1;; esac"
+    asked = {"files": {}, "conditions": {"it": {"unless": unless, "root": False}}}
+
+    with Helper.start(connection_to(tmp_path), HELPER_PARTS) as board:
+        assert board.call("look", asked).value["conditions"] == {"it": True}
+
+
+@pytest.mark.process
 def test_command_that_takes_too_long_is_ended_with_its_children(tmp_path):
     asked = {"run": f"sleep 1000 & echo $! > {tmp_path}/pid; wait", "creates": f"{tmp_path}/a"}
     with Helper.start(connection_to(tmp_path), HELPER_PARTS) as board:
