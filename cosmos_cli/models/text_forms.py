@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
@@ -12,13 +13,16 @@ NAME_PATTERN = "^[a-z0-9][a-z0-9-]*$"
 """Of scenarios. It stands here so that inventories are read without importing what scenarios are made of."""
 
 
-def like(pattern: str, expected: str) -> BeforeValidator:
+def like(
+    pattern: str, expected: str, *, holds: Callable[[re.Match[str]], bool] = bool
+) -> BeforeValidator:
     """
     Return a validator of texts that *pattern* fits as a whole; it sees the value before its type is looked at.
 
     Args:
         pattern: A regular expression.
         expected: What a person reads after "expected".
+        holds: Tells of a text that fits whether it holds what no pattern can ask for.
     """
     compiled = re.compile(pattern)
 
@@ -27,7 +31,8 @@ def like(pattern: str, expected: str) -> BeforeValidator:
             raise ValueError(f"expected {expected}")
         if len(text) > TEXT_CHARACTERS_MAX:
             raise ValueError(f"expected at most {TEXT_CHARACTERS_MAX} characters")
-        if not compiled.fullmatch(text):
+        found = compiled.fullmatch(text)
+        if found is None or not holds(found):
             raise ValueError(f"expected {expected}")
         return text
 
@@ -70,7 +75,7 @@ _PHASE = (
 )
 _LOCAL = r"(?:\+[a-z0-9]+(?:[._-][a-z0-9]+)*)?"
 _VERSION = (
-    rf"(?ai:===[ \t]*[^\s,;]+|[=!]=[ \t]*{_RELEASE}(?:\.\*|{_PHASE}{_LOCAL})"
+    rf"(?ai:===[ \t]*[^\s,;)]+|[=!]=[ \t]*{_RELEASE}(?:\.\*|{_PHASE}{_LOCAL})"
     rf"|~=[ \t]*{_RELEASE}\.\d+{_PHASE}|(?:<=|>=|<|>)[ \t]*{_RELEASE}{_PHASE})"
 )
 """As `cosmos up` reads it by packaging.specifiers, whose import would take 10 ms here."""
@@ -85,8 +90,20 @@ _OPERAND = (
 _COMPARISON = (
     rf"[ \t(]*{_OPERAND}[ \t]*(?:===?|[<>~!]=|[<>]|\bin\b|\bnot[ \t]+in\b)[ \t]*{_OPERAND}[ \t)]*"
 )
-_MARKER = rf"(?:[ \t]*;{_COMPARISON}(?:\b(?:and|or)\b{_COMPARISON})*)?"
-"""Brackets are not counted here."""
+_MARKER = rf"(?P<marker>[ \t]*;{_COMPARISON}(?:\b(?:and|or)\b{_COMPARISON})*)?"
+"""No pattern counts brackets: see `_are_brackets_closed`."""
+_QUOTED = re.compile(r"""'[^']*'|"[^"]*\"""")
+
+
+def _are_brackets_closed(requirement: re.Match[str]) -> bool:
+    """Tell whether each bracket of a requirement's marker is closed, and was opened."""
+    depth = 0
+    for letter in _QUOTED.sub("", requirement["marker"] or ""):
+        depth += (letter == "(") - (letter == ")")
+        if depth < 0:
+            return False
+    return depth == 0
+
 
 Requirement = Annotated[
     str,
@@ -94,6 +111,7 @@ Requirement = Annotated[
     like(
         rf"{_NAME}{_EXTRAS}(?:{_URL}|{_VERSIONS}){_MARKER}",
         "a Python requirement such as numpy or pyserial>=3.5,<4",
+        holds=_are_brackets_closed,
     ),
 ]
 """A package of Python, as pip takes it on its command line; never an option or a path."""
@@ -113,6 +131,7 @@ ScenarioRequirement = Annotated[
         rf"{_NAME}{_EXTRAS}(?:{_URL}|{_VERSIONS}){_MARKER}|{_OWN.pattern}",
         "a Python requirement such as numpy or pyserial>=3.5,<4, or the path of a wheel or of its"
         " sources such as ./cars",
+        holds=_are_brackets_closed,
     ),
 ]
 """A package of Python, or a distribution of one's own by its path from the scenario's folder."""

@@ -30,7 +30,7 @@ class Invocation:
         for word in words:
             if word == "--" or (self.has_tail and not word.startswith("-")):
                 return False
-            option, is_attached = self._option(word)
+            _, option, is_attached = self._options(word)
             if option == name:
                 return True
             if option in self.valued and not is_attached:
@@ -44,8 +44,10 @@ class Invocation:
                 yield word
                 yield from words
                 return
-            name, is_attached = self._option(word)
+            flags, name, is_attached = self._options(word)
             if name in LIMIT:
+                if flags:
+                    yield flags
                 if not is_attached:
                     next(words, None)
                 continue
@@ -53,12 +55,15 @@ class Invocation:
             if name in self.valued and not is_attached:
                 yield from [value for value in [next(words, None)] if value is not None]
 
-    def _option(self, word: str) -> tuple[str, bool]:
-        """Return an option's name, and whether its value is in the same word."""
+    def _options(self, word: str) -> tuple[str, str, bool]:
+        """Return short flags that a word begins with, as in -vql, its last option's name, and whether that has its value in the same word."""
         if word.startswith("--"):
             name, equals, _ = word.partition("=")
-            return name, bool(equals)
-        return word[:2], len(word) > 2
+            return "", name, bool(equals)
+        for place, letter in enumerate(word[1:] if word.startswith("-") else "", start=1):
+            if f"-{letter}" in self.valued:  # what follows is its value
+                return word[:place] if place > 1 else "", f"-{letter}", place + 1 < len(word)
+        return word, "", True
 
 
 NOTHING = Invocation(verb="")

@@ -87,7 +87,7 @@ class DevicePort:
         self._answers: deque[tuple[int, str]] = deque(maxlen=ANSWERS_MAX)
         self._unsent: dict[str, list[Any]] = {}
         self._packs: deque[list[Any]] = deque()
-        """Points of profiles that wait for room."""
+        """Points of profiles that wait for room, and values that must come before points of their output."""
         played = (c for c in channels if c.direction == "out" and not c.is_frame)
         self._packs_max = max((PACKS_MAX, *map(packs_max, played)))
         self.frames_dropped = 0
@@ -151,8 +151,11 @@ class DevicePort:
         message = [messages.WRITE, channel, sent, local_s]
         if self._unsent or self._packs:
             self.flush()
-        if messages.send(self._end, message) or (
-            self.make_room() and messages.send(self._end, message)
+        # A value that ends a profile does not overtake it.
+        is_behind = declared.passing == "newest" and any(p[1] == channel for p in self._packs)
+        if not is_behind and (
+            messages.send(self._end, message)
+            or (self.make_room() and messages.send(self._end, message))
         ):
             self._unsent.pop(channel, None)  # an older one, which must not come behind it
             return
@@ -181,6 +184,10 @@ class DevicePort:
                 f"{self.name}.{channel}: expected points, none before from_s ({from_s}); got"
                 f" {f'one at {packs[0][0]:g} s' if packs[0] else 'neither'}"
             )
+        if channel in self._unsent:
+            self.flush()
+        if channel in self._unsent:  # behind these points it would end their profile
+            self._packs.append(self._unsent.pop(channel))
         for number, pack in enumerate(packs):
             first_s = pack[0] if number else start_s
             self._packs.append([messages.PLAY, channel, first_s, pack.tobytes()])
@@ -188,9 +195,13 @@ class DevicePort:
         if len(self._packs) > self._packs_max:
             self.make_room()
         while len(self._packs) > self._packs_max:
-            self.points_lost += self._count_points(self._packs.popleft())
+            given_up = self._packs.popleft()
+            self.writes_lost += given_up[0] == messages.WRITE
+            self.points_lost += self._count_points(given_up)
 
     def _count_points(self, pack: list[Any]) -> int:
+        if pack[0] == messages.WRITE:
+            return 0
         return len(pack[-1]) // 8 // (self.channels[pack[1]].size + 1)
 
     def size_of(self, channel: str) -> int:
@@ -240,7 +251,7 @@ class DevicePort:
             "frames_dropped": self.frames_dropped,
             "writes_lost": self.writes_lost,
             "points_lost": self.points_lost,
-            "writes_left": len(self._unsent),
+            "writes_left": len(self._unsent) + sum(p[0] == messages.WRITE for p in self._packs),
             "points_left": sum(map(self._count_points, self._packs)),
         }
         return {name: count for name, count in counts.items() if count}

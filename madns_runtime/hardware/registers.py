@@ -93,8 +93,8 @@ def map_channels(given: RegisterMap) -> tuple[Channel, ...]:
     Return a channel per register of a map.
 
     Raises:
-        PluginError: A register has one limit alone, a scale of zero, no finite offset, or bits of a float to shift; or
-            there is an identity to compare and no register of it.
+        PluginError: A register has one limit alone, a scale of zero, no finite offset, or more bits to shift than it has,
+            or those of a float; or there is an identity to compare and no register of it.
     """
     if given.identity_value is not None and given.identity_address is None:
         raise PluginError("map: identity_value needs identity_address: the register that holds it")
@@ -104,6 +104,10 @@ def map_channels(given: RegisterMap) -> tuple[Channel, ...]:
             raise PluginError(f"{each.name}: expected a finite offset, got {each.offset}")
         if each.shift and each.type.startswith("f"):
             raise PluginError(f"{each.name}: shift is of integers, and {each.type} is none")
+        if each.shift >= (bits := 8 * _width(each.type)):
+            raise PluginError(
+                f"{each.name}: shift: expected less than the {bits} bits of {each.type}, got {each.shift}"
+            )
     return register_channels(given.registers)
 
 
@@ -239,10 +243,11 @@ def encode_number(kind: RegisterType, number: float, shift: int) -> bytes:
     if kind.startswith("f"):
         return struct.pack("<f" if order == "little" else ">f", held)
     width, is_signed = _width(kind), kind.startswith("i")
-    bits = 8 * width
+    bits = 8 * width - shift
     low = -(1 << bits - 1) if is_signed else 0
     high = (1 << bits - int(is_signed)) - 1
-    raw = min(max(round(held) << shift, low), high)
+    # Held before it is shifted: the bits below it may mean something else to the chip.
+    raw = min(max(round(held), low), high) << shift
     return raw.to_bytes(width, order, signed=is_signed)
 
 

@@ -12,7 +12,9 @@ from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.realtime.agent_link import AgentPort
 
 DRAIN_S = 0.1
-"""After the last tick's period, and after the host's answer, an agent listens this much longer."""
+"""After the last tick's period, and after the host's answer, an agent listens this much longer ..."""
+DRAIN_SHARE = 0.25
+"""... and no longer than this share of the time in which agents must be complete."""
 
 
 class LastAnswers:
@@ -42,6 +44,7 @@ class LastAnswers:
     ) -> None:
         self._port = port
         self._patience_s = timeouts.complete_s / 2
+        self._drain_s = min(DRAIN_S, DRAIN_SHARE * timeouts.complete_s)
         self._pump = pump
         self._finish = finish
         self._end_s = math.inf
@@ -77,9 +80,9 @@ class LastAnswers:
 
     def _until_s(self, now_s: float) -> float:
         """Return until when to listen, as it looks at *now_s*."""
-        until_s = self._end_s + DRAIN_S
+        until_s = self._end_s + self._drain_s
         if self._port.session.answered_s >= self._asked_s:
-            return max(until_s, self._port.session.answer_heard_s + DRAIN_S)
+            return max(until_s, self._port.session.answer_heard_s + self._drain_s)
         if until_s <= now_s < self._end_s + self._patience_s:
-            return now_s + DRAIN_S
+            return now_s + self._drain_s
         return until_s

@@ -233,6 +233,19 @@ def test_it_writes_to_a_serial_port_and_refuses_what_is_none(tmp_path):
             prepare("gnss_receiver", {"port": str(port)}, tmp_path).make().open()
 
 
+def test_a_port_that_is_pulled_out_is_gone_before_its_next_epoch(tmp_path):
+    terminal = Terminal()
+    with opened("gnss_receiver", tmp_path, port=terminal.port) as device:
+        os.write(terminal.fd, b"order")
+        wait_until(lambda: device.read() and device.health()["heard_bytes"])
+        assert device.read().values == {"epochs": 0.0}  # idle, and not gone
+        terminal.close()
+        with pytest.raises(MachineError, match="/dev/pts/.* is gone"):
+            device.read()
+
+    assert device.health()["heard_bytes"] == 5
+
+
 def test_a_link_takes_no_place_of_something_else_and_tells_who_took_its_own(tmp_path):
     (tmp_path / "file").write_text("mine")
     with (

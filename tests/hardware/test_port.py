@@ -119,6 +119,72 @@ def test_an_older_value_that_found_no_room_does_not_come_behind_a_newer_one(devi
     assert sent == [2.0]
 
 
+def fill(made):
+    """Hand over frames until there is no room for the smallest value."""
+    size = 1000
+    while size:
+        lost = made.writes_lost
+        made.write("sent", b"x" * size)
+        size = size if made.writes_lost == lost else size // 2
+
+
+def what_comes_of(made, theirs, channel):
+    """Return the words of what was handed over for a channel, in the order in which it comes once there is room."""
+    words = []
+    theirs.setblocking(False)
+    while True:
+        came = list(messages.receive_all(theirs))
+        words += [word for word, name, *_ in came if name == channel]
+        if not came:
+            return words
+        made.flush()
+
+
+def test_a_value_and_a_profile_of_an_output_that_found_no_room_come_in_their_order(device):
+    made, theirs = device
+    fill(made)
+    made.write("level", 1.0)
+    made.play("level", [(5.0, 2.0), (6.0, 3.0)])
+
+    assert what_comes_of(made, theirs, "level") == [messages.WRITE, messages.PLAY]
+    assert set(made.losses()) == {"writes_lost"}  # of what filled the socket
+
+
+def test_a_value_that_ends_a_profile_does_not_overtake_it(device, monkeypatch):
+    made, _ = device
+    sent = []
+    room = iter(
+        [False, False, True, True]
+    )  # there is some between the look for the points and the value
+
+    def send(end, message):
+        has_room = next(room, True)
+        if has_room:
+            sent.append(message[0])
+        return has_room
+
+    monkeypatch.setattr(messages, "send", send)
+    made.play("level", [(5.0, 2.0)])
+    made.write("level", 1.0)
+    made.flush()
+
+    assert sent == [messages.PLAY, messages.WRITE]
+
+
+def test_a_value_that_waits_before_points_is_counted_as_one(device, monkeypatch):
+    made, _ = device
+    monkeypatch.setattr(messages, "send", lambda end, message: False)
+    made.write("level", 1.0)
+    made.play("level", [(5.0, 2.0), (6.0, 3.0)])
+    made.write("level", 4.0)
+
+    assert made.losses() == {"writes_left": 2, "points_left": 2}
+    for number in range(port.PACKS_MAX):
+        made.play("level", [(7.0 + number, 5.0)])
+    left = {"points_left": port.PACKS_MAX}
+    assert made.losses() == {"writes_lost": 2, "points_lost": 2, **left}
+
+
 @pytest.mark.parametrize("due_s", [math.nan, math.inf, -math.inf])
 def test_a_write_at_no_time_is_refused_and_holds_up_no_other(device, due_s):
     made, theirs = device

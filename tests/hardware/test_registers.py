@@ -218,6 +218,7 @@ def test_a_period_keeps_a_register_from_being_read_each_time():
         ({"scale": 0.0}, "angle: expected a scale other than 0"),
         ({"address": 300}, "address"),
         ({"safe": 91.0}, "angle: safe value"),
+        ({"type": "u8", "shift": 8}, "angle: shift: expected less than the 8 bits of u8, got 8"),
     ],
 )
 def test_a_faulty_map_is_refused(change, told):
@@ -259,6 +260,23 @@ def test_a_number_beyond_all_bounds_is_held_to_what_the_register_can_hold(kind, 
     register = {"name": "level", "address": 0x10, "type": kind, "direction": "out", "scale": 1e-9}
     with opened("i2c", address=0x19, map={"registers": [register]}) as device:
         device.write({"level": -1e305}, 0.0)
+
+    assert bytes(CHIP[0x10:0x12]) == held
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "held"),
+    [
+        ("u16_be", 1e6, b"\xff\xf0"),
+        ("u16_le", 4095.0, b"\xf0\xff"),
+        ("i16_be", 1e6, b"\x7f\xf0"),
+        ("i16_be", -1e6, b"\x80\x00"),
+    ],
+)
+def test_bits_below_a_number_that_stands_left_stay_zero(kind, value, held):
+    register = {"name": "level", "address": 0x10, "type": kind, "direction": "out", "shift": 4}
+    with opened("i2c", address=0x19, map={"registers": [register]}) as device:
+        device.write({"level": value}, 0.0)
 
     assert bytes(CHIP[0x10:0x12]) == held
 

@@ -27,7 +27,7 @@ class Timer:
 class Rig:
     """An agent whose last tick was over at 49 s, and a clock that is set."""
 
-    def __init__(self, monkeypatch):
+    def __init__(self, monkeypatch, complete_s=COMPLETE_S):
         self.now_s, self.finished_s, self.pings = END_S - 1.0, None, []
         monkeypatch.setattr(last_answers, "monotonic", lambda: self.now_s)
         self.timer = Timer()
@@ -45,7 +45,7 @@ class Rig:
         self.listening = LastAnswers(
             SimpleNamespace(call_at=self._made),
             port,
-            Timeouts(complete_s=COMPLETE_S),
+            Timeouts(complete_s=complete_s),
             pump=lambda: None,
             finish=self._finish,
         )
@@ -122,6 +122,21 @@ def test_a_host_that_says_nothing_is_not_waited_for_for_ever(rig):
     rig.run_until(END_S + 100.0)
 
     assert rig.finished_s == pytest.approx(END_S + COMPLETE_S / 2, abs=2 * DRAIN_S)
+
+
+@pytest.mark.parametrize("complete_s", [0.2, 0.05, 0.001])
+@pytest.mark.parametrize("answered_after", [0.0, 0.4, math.inf])
+def test_an_agent_is_complete_in_time_however_short_that_is(
+    monkeypatch, complete_s, answered_after
+):
+    rig = Rig(monkeypatch, complete_s)
+    rig.run_until(END_S)
+    if answered_after < math.inf:
+        rig.run_until(END_S + answered_after * complete_s)
+        rig.answer()
+    rig.run_until(END_S + 1.0)
+
+    assert END_S < rig.finished_s <= END_S + 0.9 * complete_s
 
 
 def test_a_run_that_ended_otherwise_is_not_finished(rig):

@@ -14,6 +14,7 @@ from typing import Any
 
 from madns_runtime.errors import MachineError
 from madns_runtime.hardware.contract import Device, Sample, Value
+from madns_runtime.hardware.drivers.hang_up import is_hung_up
 from madns_runtime.hardware.gnss_messages import ToldQuality, encode
 from madns_runtime.hardware.gnss_solution import GnssSolution
 
@@ -65,14 +66,33 @@ class GnssReceiver(Device):
         Return how many epochs went out.
 
         Raises:
-            MachineError: The link's place is taken.
+            MachineError: The link's place is taken, or the port is gone.
         """
         if self._other_fd >= 0:
             self._keep_link(os.ttyname(self._other_fd))
-        with contextlib.suppress(BlockingIOError, OSError):
-            self._heard_bytes += len(os.read(self._fd, READ_BYTES))
+        self._hear()
         self._write_rest()
         return Sample(values={"epochs": float(self._epochs)}, taken_s=monotonic())
+
+    def _hear(self) -> None:
+        """
+        Count what somebody says; that tells of a port that is gone before an epoch is due.
+
+        Raises:
+            MachineError: It is.
+        """
+        try:
+            data = os.read(self._fd, READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            raise self._gone(error.strerror) from None
+        self._heard_bytes += len(data)
+        if not data and is_hung_up(self._fd):  # an idle line may read as empty, too
+            raise self._gone("end of file")
+
+    def _gone(self, why: str | None) -> MachineError:
+        return MachineError(f"{self.parameters.port or self._link} is gone: {why}")
 
     def _keep_link(self, terminal: str) -> None:
         """
@@ -126,8 +146,7 @@ class GnssReceiver(Device):
         except BlockingIOError:
             return 0
         except OSError as error:
-            where = self.parameters.port or self._link
-            raise MachineError(f"{where} is gone: {error.strerror}") from None
+            raise self._gone(error.strerror) from None
 
     def health(self) -> Mapping[str, float | int | str | bool | None]:
         """Return what was not taken, and how much somebody said to the receiver, which takes no orders."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import select
 from collections.abc import Mapping
 from time import monotonic
 from typing import Any
@@ -14,6 +13,7 @@ from serial.rs485 import RS485Settings
 
 from madns_runtime.errors import MachineError
 from madns_runtime.hardware.contract import Device, Sample, Value
+from madns_runtime.hardware.drivers.hang_up import is_hung_up
 from madns_runtime.hardware.framing import Framer, make_framer
 
 READ_BYTES = 65_536
@@ -112,7 +112,7 @@ class SerialDevice(Device):
             self.count("garbage_bytes", framer.garbage_bytes - before[0])
             self.count("bad_checksums", framer.bad_checksums - before[1])
             self._is_drained = bool(self._frames)
-        elif _is_hung_up(self._fd):  # an idle line reads as empty, too
+        elif is_hung_up(self._fd):  # an idle line reads as empty, too
             raise MachineError(f"{self.parameters.port} is gone: end of file")
 
     def write(self, values: Mapping[str, Value], due_s: float) -> None:
@@ -157,13 +157,6 @@ class SerialDevice(Device):
             raise MachineError(
                 f"{self.parameters.port} does not take {len(data)} bytes: {error}"
             ) from None
-
-
-def _is_hung_up(fd: int) -> bool:
-    """Tell whether nothing more can come: the adapter was pulled out, or the other end is closed."""
-    poll = select.poll()
-    poll.register(fd, select.POLLIN)
-    return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
 
 
 def _why_closed(port: str, error: Exception) -> str:

@@ -124,12 +124,23 @@ def test_only_the_newest_are_kept(inventory, tmp_path, monkeypatch, capsys):
         (["--limit=x", "s.yaml"], ["s.yaml"]),
         (["--timeout", "-l", "-i", "a"], ["--timeout", "-l", "-i", "a"]),
         (["--", "-l", "x"], ["--", "-l", "x"]),
+        (["-ql", "x", "-i", "a"], ["-q", "-i", "a"]),
+        (["-vvqlx", "-i", "a"], ["-vvq", "-i", "a"]),
+        (["-qi", "-l", "-l", "x"], ["-qi", "-l"]),
+        (["-il", "-q"], ["-il", "-q"]),
     ],
 )
 def test_limit_of_a_command_line_is_replaced(words, rest):
     invocation = Invocation(verb="up", words=tuple(words), valued=VALUED)
 
     assert shlex.split(invocation.with_limit("@f")) == ["cosmos", "up", "--limit", "@f", *rest]
+
+
+def test_limit_behind_bundled_options_is_replaced_before_words_for_machines():
+    words = ("-qi", "a", "-l", "x", "ls", "-l", "x")
+    invocation = Invocation(verb="exec", words=words, valued=VALUED, has_tail=True)
+
+    assert shlex.split(invocation.with_limit("@f"))[4:] == ["-qi", "a", "ls", "-l", "x"]
 
 
 def test_words_for_machines_stay_as_they_are():

@@ -15,6 +15,7 @@ TAKEN = (
     "a~=V1.0-ALPHA; 'arm' not in platform_machine",
     "a===anything; extra == 'x'",
     "a @ file:///a.whl ; os_name == 'posix'",
+    "a; ((os_name == ')') and (sys.platform != \"(\"))",
 )
 REFUSED = (
     "x;y",
@@ -27,8 +28,13 @@ REFUSED = (
     "x==foo",
     "x~=1",
     "x>=1.0+local",
+    "x===1.0)",
     "x\n>=1",
     "x; os_name == 'a'\nand os_name == 'b'",
+    "x; (python_version > '3'",
+    "x; python_version > '3')",
+    "x; os_name == 'a') or (os_name == 'b'",
+    "x @ file:///a.whl ; (os_name == ')'",
 )
 
 
