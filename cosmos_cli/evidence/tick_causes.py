@@ -60,8 +60,8 @@ WORDS: Final[Mapping[str, CauseWords]] = {
     ),
     Cause.WAKE_UP: CauseWords(
         "the kernel woke the loop late, or gave its processor to another program",
-        "permit SCHED_FIFO (`cosmos doctor` tells how; scheduling.policy), end what else runs there, give a machine"
-        " fewer agents, or let more of them share a process (agents.per_process)",
+        "permit SCHED_FIFO where it is refused (`cosmos doctor` tells; scheduling.policy), end what else runs there,"
+        " give a machine fewer agents, or let more of them share a process (agents.per_process)",
     ),
     Cause.STEP: CauseWords(
         "the agent's own step before took longer than its period",

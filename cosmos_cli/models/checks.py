@@ -184,6 +184,8 @@ class _Placing:
             yield (rule.word,), f"{text}: {rule.words('s')} never holds"
         elif rule.kind in OF_NUMBERS and rule.word and not rule.bounds().overlap(0.0, math.inf):
             yield (rule.word,), f"a {rule.kind} is never less than 0: {rule.words()} never holds"
+        elif rule.kind == "count" and rule.word and not rule.bounds().hold_a_whole_number():
+            yield (rule.word,), f"a count is a whole number: {rule.words()} never holds"
 
     def _timeless_faults(self) -> Iterator[RuleFault]:
         rule = self._rule

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.checks import scenario_checks, unjudged_remark
-from cosmos_cli.models.document import Document, read_document
+from cosmos_cli.models.document import Document, dotted, read_document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.executor_answer import EXECUTOR_KIND, ask_executor
 from cosmos_cli.models.expectation import Expectation, conditions_of_checks
@@ -27,6 +27,7 @@ from cosmos_cli.models.place_uses import cure_of, shared_places
 from cosmos_cli.models.plugin_answers import ask_plugin
 from cosmos_cli.models.plugin_demand import ask_plugin_demand
 from cosmos_cli.models.scenario import OF_AUTHORS, Scenario, cross_faults
+from cosmos_cli.models.test_settings import settings_without_variables
 from cosmos_cli.models.timeline import NO_TIMELINE, ResolvedTimeline, resolve_timeline
 from cosmos_cli.models.timeline_rules import NO_TIME
 from cosmos_cli.models.translate import faults_of
@@ -127,8 +128,14 @@ class ScenarioFile:
     def to_written(self) -> dict[str, Any]:
         """Return the same as a scenario file holds it: what is no variable there is escaped."""
         kept = texts_with_words(self.document, self.placeholders)
+        kept |= {("test", "set", dotted(path)) for path in kept}
         values: dict[str, Any] = escaped_values(json.loads(json.dumps(self.to_mapping())), kept)
         return values
+
+    def with_test_settings(self, settings: Mapping[str, Any]) -> ScenarioFile:
+        """Return the same with another `test.set`."""
+        test = replace(self.scenario.test, set=dict(settings))
+        return replace(self, scenario=self.scenario.model_copy(update={"test": test}))
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the scenario as plain values, overrides applied and defaults filled in."""
@@ -155,6 +162,7 @@ def load_scenario(
     """
     source = read_scenario_source(path)
     document = source.document
+    settings = settings_without_variables(document, overrides)
     faults = [*author_override_faults(document, overrides), *apply_overrides(document, overrides)]
     substitute_variables(document)
     faults += document.faults
@@ -162,7 +170,7 @@ def load_scenario(
     checked = _check(source, path, tuple(overrides), faults + old_faults)
     for remark in remarks:
         warn(remark)
-    return checked
+    return checked if settings is None else checked.with_test_settings(settings)
 
 
 def check_scenario(text: str, path: Path) -> ScenarioFile:

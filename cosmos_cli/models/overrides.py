@@ -64,6 +64,15 @@ def parse_override(override: str) -> tuple[str, Path, Any]:
     return _parsed(override)[:3]
 
 
+def override_steps(override: str) -> tuple[str, ...]:
+    """Return a dotted key as its steps; of one that is no key, the whole, which is told of later."""
+    try:
+        _, path, _ = parse_override(override)
+    except InputError:
+        return (override,)
+    return tuple(map(str, path))
+
+
 def _parsed(override: str) -> tuple[str, Path, Any, str]:
     """Return key, path and value of KEY=VALUE, and the value as it is written if it is a plain scalar."""
     key, equals, text = override.partition("=")

@@ -139,6 +139,8 @@ def _origin(document: Document, path: Path) -> Origin:
         "parameters",
     ):  # of all agents, as the rule says nothing
         return _origin(document, path[2:])
+    if path[:2] == ("test", "set"):  # of a variable that the test sets
+        return _origin_at(document, document.place(path[:2]))
     return Origin()
 
 

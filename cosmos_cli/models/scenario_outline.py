@@ -17,12 +17,11 @@ from cosmos_cli.models.baseline import Baseline, read_baseline
 from cosmos_cli.models.document import Document
 from cosmos_cli.models.extending import read_scenario_source
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
-from cosmos_cli.models.overrides import parse_override
-from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test, override_of
+from cosmos_cli.models.overrides import override_steps
+from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test
+from cosmos_cli.models.test_settings import SECTION, giving_way, test_overrides
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import substitute_variables
-
-SECTION = "test"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,13 +47,7 @@ class ScenarioOutline:
         """
         if not is_shortened:
             return list(given)
-        taken = [_steps(override) for override in given]
-        own = [
-            override
-            for override in self._own()
-            if not any(_steps(override)[: len(steps)] == steps for steps in taken)
-        ]
-        return [*own, *given]
+        return [*giving_way(self._own(), given), *given]
 
     def load(self, overrides: Sequence[str], warn: Callable[[str], None]) -> ScenarioFile:
         """
@@ -93,13 +86,7 @@ class ScenarioOutline:
         return read_baseline(path)
 
     def _own(self) -> list[str]:
-        return [self._override(key, value) for key, value in self.settings.items()]
-
-    def _override(self, key: str, value: Any) -> str:
-        written = self.document.texts.get((SECTION, "set", key))
-        if written and isinstance(value, int | float):  # 007, for whoever has it in a longer text
-            return f"{key}={written}"
-        return override_of(key, value)
+        return test_overrides(self.document, self.settings)
 
     def _placed(self, fault: Fault, applied: set[str]) -> Fault:
         """Return a fault of --set KEY=VALUE at KEY of `test.set`, if it came from there."""
@@ -188,16 +175,7 @@ def with_seed(overrides: Sequence[str], seed: int | None) -> list[str]:
     """Return settings with the seed of a run; None for the scenario's own."""
     if seed is None:
         return list(overrides)
-    return [*(item for item in overrides if _steps(item) != ("seed",)), f"seed={seed}"]
-
-
-def _steps(override: str) -> tuple[str, ...]:
-    """Return a dotted key as its steps; of one that is no key, the whole, which is told of later."""
-    try:
-        _, path, _ = parse_override(override)
-    except InputError:
-        return (override,)
-    return tuple(map(str, path))
+    return [*(item for item in overrides if override_steps(item) != ("seed",)), f"seed={seed}"]
 
 
 _ADAPTER: TypeAdapter[ScenarioTest] = TypeAdapter(ScenarioTest)

@@ -65,6 +65,12 @@ class ValueBounds:
             )
         return (self.high is None or self.high > first) and (self.low is None or self.low < last)
 
+    def hold_a_whole_number(self) -> bool:
+        """Tell whether some whole number lies within; of bounds that nothing lies within, that is not the reason."""
+        if self.low is None or self.high is None or self.low > self.high:
+            return True
+        return math.isinf(self.low) or math.ceil(self.low) <= self.high
+
     def negated(self) -> ValueBounds:
         """Return the bounds of every value that does not hold here."""
         return replace(self, is_negated=not self.is_negated)

@@ -50,7 +50,7 @@ def test_the_dominant_cause_is_told_with_share_and_cure():
 
     (remark,) = totals.remarks(0.005)
     assert "4 ticks missed, 0 late by more than 5 ms: 75% by wake_up" in remark
-    assert "SCHED_FIFO" in remark
+    assert "SCHED_FIFO where it is refused" in remark  # the run may have had it
     assert totals.hint.startswith("75% by wake_up: ")
 
 

@@ -129,6 +129,8 @@ BROKEN = [
     ("name: summary.x, event: start", "summary.x", "framework's own"),
     ("name: a, stream: ticks, statistic: rate, above: 1, from_s: 3, to_s: 3", "3}", "of a stretch of time"),
     ("name: a, stream: ticks, statistic: count, below: 0", "0}", "a count is never less than 0: below 0 never holds"),
+    ("name: a, stream: ticks, statistic: count, within: [1.2, 1.8]", "[1.2", "a count is a whole number: within 1.2 and 1.8 never holds"),
+    ("name: a, stream: ticks, statistic: count, equals: 1.5", "1.5}", "a count is a whole number"),
     ("name: a, stream: ticks, statistic: rate, within: [-3, -1]", "[-3", "never less than 0"),
     (f"{TICKS}, statistic: first_time, when: {{above: 3}}, below: 5, from_s: 9", "5,", "from 9 s to 60 s"),
     (f"{TICKS}, statistic: settled, when: {{above: 3}}, above: 60", "60}", "from 0 s to 60 s: above 60 s never holds"),
@@ -254,6 +256,11 @@ def test_checks_none_of_which_can_be_judged_are_told_before_the_run(tmp_path, mo
 
     assert len(found.remarks) == len(told)
     assert all(words in remark.text for words, remark in zip(told, found.remarks, strict=True))
+
+
+@pytest.mark.parametrize("limit", ["equals: -1e+308, tolerance: 1.7e+308", "within: [1.2, 2]"])
+def test_a_limit_that_a_count_can_keep_is_no_fault(tmp_path, limit):
+    assert load(f"name: a, stream: ticks, statistic: count, {limit}", folder=tmp_path).expectations
 
 
 def test_a_device_with_faults_of_its_own_is_still_one_of_its_agents(tmp_path):

@@ -8,6 +8,7 @@ import yaml
 from cosmos_cli.app import main
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.models.resolved import origins, resolved_lines, resolved_values
+from cosmos_cli.models.scenario_outline import check_test, read_outline
 
 BASE = "name: base\nsimulation: counter\nvars: {rate: 5}\nagents: {count: 3, tick_hz: '${rate}'}\n"
 SCENARIO = """\
@@ -134,3 +135,40 @@ def test_a_root_above_is_told_so_that_what_is_printed_finds_its_files(tmp_path, 
         f"{says_root}:{3 if 'few' in says_root else 4}"
     )
     assert load_scenario(again).root == scenario.root == tmp_path
+
+
+SHORTENED = """\
+name: shortened
+simulation: counter
+vars: {n: 4, word: late, limit: 3, unused: 1}
+description: "${n} agents, ${word}"
+agents: {count: "${n}", tick_hz: 20}
+time: {mode: lockstep, duration_s: 60}
+timeline:
+  - {at_s: 5, action: annotate, text: "${word} at ${n} of ${limit}"}
+parameters: {payload_bytes: "${limit}"}
+checks:
+  - {name: few, stream: round_trips, field: packet, within: [0, "${limit}"]}
+test:
+  set: {vars.n: 2, time.duration_s: 10, vars.word: '$${n}', "timeline[0].at_s": "${limit}", vars.limit: 007, vars.unused: 2}
+"""
+
+
+@pytest.mark.parametrize("given", [(), ("vars.n=3",), ("agents.count=5",)])
+def test_what_results_is_the_same_as_a_test_too_where_that_sets_variables(tmp_path, given):
+    """Whose names what results does not have: `cosmos validate` refused it, and a run's own scenario.yaml."""
+    path, again = tmp_path / "a.yaml", tmp_path / "again.yaml"
+    path.write_text(SHORTENED)
+    found = load_scenario(path, given)
+    again.write_text("\n".join(resolved_lines(found)))
+    outline, other = read_outline(path), read_outline(again)
+
+    check_test(load_scenario(again), print)
+
+    shortened = outline.load(outline.overrides(given), print)
+    same = other.load(other.overrides(given if "vars" not in "".join(given) else ()), print)
+    assert same.timeline.entries[0].at_s == 7
+    assert shortened.to_mapping() | {"test": None} == same.to_mapping() | {"test": None}
+    assert [one for one in other.settings if one.startswith("vars")] == []
+    lines = {line.partition(":")[0].strip(): line for line in again.read_text().splitlines()}
+    assert lines['"checks[0].within[1]"'].endswith("/a.yaml:13")
