@@ -37,6 +37,7 @@ from cosmos_cli.fleet.ssh.failures import (
     jump_failure,
     lost,
     opening_failure,
+    unanswered_jump,
     unrecorded_failure,
 )
 from cosmos_cli.fleet.ssh.host_certificate import read_certificate
@@ -56,6 +57,8 @@ OPEN_TIMEOUT_S = 20.0
 INPUT_POLL_S = 0.005
 QUIET_S = 5.0
 """After so long without output of a command its machine is asked for a sign of life."""
+NO_CHANNEL = "Timeout opening channel."
+"""Text of paramiko where the other side says nothing."""
 LIMITS_POLL_S = 0.25
 """Between looks at the limits of a command that writes to standard error alone, or nothing."""
 
@@ -165,6 +168,9 @@ class SshConnection:
         except ChannelException as error:
             raise jump_failure(error.code, error.text, f"{host} port {port}") from error
         except (SSHException, OSError, EOFError) as error:
+            if str(error) == NO_CHANNEL:
+                where = f"{host} port {port}"
+                raise unanswered_jump(where, timeout_s, is_alive=self.is_alive()) from error
             raise opening_failure(error, f"{host} port {port}", timeout_s) from error
         return SshSocket(channel, addresses=(self.own_address, host))
 

@@ -111,6 +111,21 @@ def jump_failure(code: int, said: str, where: str) -> MachineFailure:
     )
 
 
+def unanswered_jump(where: str, timeout_s: float, *, is_alive: bool) -> MachineFailure:
+    """Say that a jump host had nothing to tell of its way further: the machine does not answer it, or it hangs itself."""
+    if not is_alive:
+        return MachineFailure(
+            FailureKind.FROZEN,
+            f"{where}: the jump host stopped answering",
+            "it hangs: wait, or switch it off and on",
+        )
+    return MachineFailure(
+        FailureKind.UNREACHABLE,
+        f"{where}: the jump host got no answer of it in {duration_words(timeout_s)}",
+        "is it switched on, on that network, and its address right?",
+    )
+
+
 def _silent(where: str) -> MachineFailure:
     return MachineFailure(
         FailureKind.REFUSED,

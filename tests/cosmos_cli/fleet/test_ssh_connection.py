@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import pytest
 from harness.ports import free_port
 from harness.waiting import wait_until
+from paramiko.ssh_exception import SSHException
 from ssh_harness import needs_sshd, target_of, write_configuration
 from sshd import Sshd, make_key, public, silent_server
 
@@ -644,6 +645,28 @@ def test_machine_behind_a_jump_host_that_is_not_reached_is_told(known, home):
         connect(target_of(known, address="127.0.0.9", port=free_port("127.0.0.9")), DEFAULT)
 
     assert "the jump host does not reach it" in caught.value.text
+
+
+@pytest.mark.parametrize(
+    ("is_alive", "kind", "told"),
+    [
+        (True, FailureKind.UNREACHABLE, "pi port 22: the jump host got no answer of it in 3 s"),
+        (False, FailureKind.FROZEN, "pi port 22: the jump host stopped answering"),
+    ],
+)
+def test_machine_that_a_jump_host_gets_no_answer_of_is_not_one_that_opens(is_alive, kind, told):
+    """As of one that is switched off: sshd there waits longer than anybody here."""
+
+    def open_channel(*arguments, **more):
+        raise SSHException("Timeout opening channel.")
+
+    transport = SimpleNamespace(open_channel=open_channel)
+    hop = SimpleNamespace(transport=transport, is_alive=lambda: is_alive)
+
+    with failing(kind) as caught:
+        connection_module.SshConnection.wire_to(hop, "pi", 22, timeout_s=3.0)
+
+    assert caught.value.text == told
 
 
 def test_jump_host_for_all_hosts_is_not_its_own(own_sshd, home):
