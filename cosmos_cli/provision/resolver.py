@@ -46,6 +46,8 @@ NO_NETWORK = re.compile(
 )
 NO_ROOM = re.compile(r"no space left on device|disk quota exceeded", re.IGNORECASE)
 SECRET = re.compile(r"://[^/@\s]+@")
+NOBODYS_PROJECT = '[project]\nname = "nobody"\nversion = "0"\n[tool.uv.workspace]\n'
+"""Else uv heeds that of the present folder, or of one above it, and what it finds is remembered for all folders."""
 EXTRA_INDEXES = ("UV_INDEX", "UV_EXTRA_INDEX_URL")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
 
@@ -67,12 +69,14 @@ def resolve(requirements: Sequence[str], platform: Platform) -> tuple[Candidate,
     settings = pip_settings()
     if settings.get("no-index") in ("1", "true", "yes", "on"):
         command.append("--no-index")
-    done = _run(
-        command,
-        timeout_s=RESOLVE_TIMEOUT_S,
-        stdin="\n".join([*index_lines(settings, os.environ), *requirements]),
-        environment=uv_environment(settings, os.environ),
-    )
+    with tempfile.TemporaryDirectory(prefix="cosmos-") as nobodys:
+        Path(nobodys, "pyproject.toml").write_text(NOBODYS_PROJECT)
+        done = _run(
+            [command[0], "--project", nobodys, *command[1:]],
+            timeout_s=RESOLVE_TIMEOUT_S,
+            stdin="\n".join([*index_lines(settings, os.environ), *requirements]),
+            environment=uv_environment(settings, os.environ),
+        )
     if done.returncode:
         raise _resolve_failure(done.stderr, requirements, platform)
     return parse_pylock(done.stdout, platform)
