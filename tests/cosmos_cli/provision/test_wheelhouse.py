@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 
@@ -344,6 +345,17 @@ def test_older_version_is_taken_when_it_is_asked_for(index, requirement):
     make_source(index, "lgpio", "0.2.2.0")
 
     assert "lgpio-0.0.0.2-py3-none-any.whl" in filenames(prepare(PI, [requirement]))
+
+
+def test_computer_without_room_for_a_temporary_file_is_told_as_such(index, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/proc", "/sys"])
+
+    failure = refused(PI, [])
+
+    assert failure.kind is FailureKind.DISK_FULL
+    assert "no room on this computer" in failure.text
+    assert "TMPDIR" in failure.advice
 
 
 def test_project_of_the_present_folder_decides_on_no_version(index, tmp_path, monkeypatch):
