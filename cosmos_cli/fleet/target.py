@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.models.connection_kind import ConnectionKind
 from cosmos_cli.models.inventory_arguments import Given
 from cosmos_cli.system.import_turn import IMPORT_TURN
@@ -71,6 +72,18 @@ _KINDS: Mapping[str, tuple[type, ...]] = {
     "port": (int, type(None)),
     "may_become_root": (bool,),
 }
+
+
+def require_root(target: Target, advice: str) -> None:
+    """
+    Refuse a machine where nobody may become root.
+
+    Raises:
+        MachineFailure: NO_SUDO, with *advice*.
+    """
+    if not target.may_become_root:
+        text = "the inventory forbids to become root there (ansible_become: false)"
+        raise MachineFailure(FailureKind.NO_SUDO, text, advice)
 
 
 def target_of(machine: Machine) -> Target:
