@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     # What reads a target from a plan needs no inventory, whose models take long to import.
     from cosmos_cli.models.inventory import Machine
 
+ROOT_FORBIDDEN = "the inventory forbids to become root there (ansible_become: false)"
 ROOT_DEFAULT = "~/cosmos"
 """Folder of COSMoS on a machine; ~ is the home of who logs in."""
 
@@ -82,8 +83,7 @@ def require_root(target: Target, advice: str) -> None:
         MachineFailure: NO_SUDO, with *advice*.
     """
     if not target.may_become_root:
-        text = "the inventory forbids to become root there (ansible_become: false)"
-        raise MachineFailure(FailureKind.NO_SUDO, text, advice)
+        raise MachineFailure(FailureKind.NO_SUDO, ROOT_FORBIDDEN, advice)
 
 
 def target_of(machine: Machine) -> Target:
