@@ -87,7 +87,7 @@ def state_directory() -> Path:
     """Return where the register is: COSMOS_STATE_DIR, XDG_STATE_HOME/cosmos or ~/.local/state/cosmos, processes."""
     own = os.environ.get("COSMOS_STATE_DIR")
     if own:
-        return Path(own) / "processes"
+        return Path(os.path.expanduser(own)) / "processes"
     shared = os.environ.get("XDG_STATE_HOME")
     home = os.path.expanduser("~")
     if home == "~":  # as of a number for which nobody stands; containers give such a one this home

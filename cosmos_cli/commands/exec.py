@@ -18,7 +18,6 @@ from cosmos_cli.commands.fleet_command import (
     InventoryOption,
     LimitOption,
     fleet_of,
-    require_root,
 )
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connection import Completed, Connection
@@ -26,6 +25,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure, runs_no_comman
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.shell import NO_SUDO_MARK, watched, without_mark
+from cosmos_cli.fleet.target import require_root
 from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.foreign_text import clean_text
 from cosmos_cli.ui.plural import counted

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosmos_cli.errors import ExitCode, InputError
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.fleet import Fleet, fleet_of
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
 from cosmos_cli.fleet.retry_file import offer_retry
-from cosmos_cli.fleet.target import Target
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.console import Console
@@ -133,18 +131,6 @@ def without_this_computer(console: Console, fleet: Fleet) -> Fleet:
         if target.connection == "local":
             console.say(f"{target.name}: left alone, it is this computer")
     return fleet.elsewhere()
-
-
-def require_root(target: Target, advice: str) -> None:
-    """
-    Refuse a machine where nobody may become root.
-
-    Raises:
-        MachineFailure: NO_SUDO, with *advice*.
-    """
-    if not target.may_become_root:
-        text = "the inventory forbids to become root there (ansible_become: false)"
-        raise MachineFailure(FailureKind.NO_SUDO, text, advice)
 
 
 def finish(

@@ -19,7 +19,6 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     finish,
     fleet_of,
-    require_root,
     without_this_computer,
 )
 from cosmos_cli.errors import InputError
@@ -29,6 +28,7 @@ from cosmos_cli.fleet.fleet import Fleet
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.outcome import InOrder, Outcome, failed
+from cosmos_cli.fleet.target import require_root
 from cosmos_cli.onboard.apt_words import PYTHON_HINT
 from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted

@@ -125,6 +125,7 @@ def ask(
         "runs": layout.runs,
         "environments": layout.environments,
         "state": layout.state,
+        "sudo": connection.target.may_become_root,
     }
     return _call(
         connection,
@@ -154,6 +155,7 @@ def ask_here(
         "root": runs,
         "state": state,
         "interface": interface,
+        "sudo": True,
     }
     return _call(connection, arguments)
 

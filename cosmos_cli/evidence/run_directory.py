@@ -169,7 +169,7 @@ def runs_root(option: str | os.PathLike[str] | None = None) -> Path:
     Raises:
         InputError: Its path is no UTF-8.
     """
-    root = Path(option or os.environ.get(RUNS_VARIABLE) or RUNS_FOLDER)
+    root = Path(os.path.expanduser(option or os.environ.get(RUNS_VARIABLE) or RUNS_FOLDER))
     check_path_is_text(root)
     return root
 

@@ -12,7 +12,7 @@ from cosmos_cli.fleet.connection import SMALL_BYTES_MAX, Connection, ConnectOpti
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from cosmos_cli.fleet.target import Target
+from cosmos_cli.fleet.target import Target, require_root
 from cosmos_cli.onboard.request_loop import BOOT_ID_FILE
 
 PARTS = ("madns_runtime.processes", "processes", "scratch", "power")
@@ -21,6 +21,7 @@ REFUSED_INTERVAL_S = 5.0
 """After a refused login: a machine that is starting refuses everybody, and sshd is slow to forgive."""
 TRY_TIMEOUT_S = 5.0
 ORDER_TIMEOUT_S = 15.0
+ROOT_ADVICE = "leave that machine out with --limit, or reboot it by hand"
 FINAL = (FailureKind.HOST_KEY_CHANGED, FailureKind.HOST_KEY_UNKNOWN)
 """Failures that more patience does not mend."""
 
@@ -72,6 +73,8 @@ class Rebooting:
             boot_id = str(told["boot_id"])
             if boot_id == self.own_boot_id:
                 return boot_id, time.monotonic()
+            if board.greeting["uid"] != 0:  # who is root already becomes nobody
+                require_root(connection.target, ROOT_ADVICE)
             if not self.is_forced:
                 refuse_if_living(told["living"])
                 if told["has_root"]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.models.connection_kind import ConnectionKind
 from cosmos_cli.models.inventory_arguments import Given
 from cosmos_cli.system.import_turn import IMPORT_TURN
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     # What reads a target from a plan needs no inventory, whose models take long to import.
     from cosmos_cli.models.inventory import Machine
 
+ROOT_FORBIDDEN = "the inventory forbids to become root there (ansible_become: false)"
 ROOT_DEFAULT = "~/cosmos"
 """Folder of COSMoS on a machine; ~ is the home of who logs in."""
 
@@ -71,6 +73,17 @@ _KINDS: Mapping[str, tuple[type, ...]] = {
     "port": (int, type(None)),
     "may_become_root": (bool,),
 }
+
+
+def require_root(target: Target, advice: str) -> None:
+    """
+    Refuse a machine where nobody may become root.
+
+    Raises:
+        MachineFailure: NO_SUDO, with *advice*.
+    """
+    if not target.may_become_root:
+        raise MachineFailure(FailureKind.NO_SUDO, ROOT_FORBIDDEN, advice)
 
 
 def target_of(machine: Machine) -> Target:

@@ -35,7 +35,7 @@ def doctor(request: VerbRequest) -> dict[str, PlainValue]:
     Look at everything; takes about as long as the wake-ups that are measured.
 
     Args:
-        request: "wake_ups" (count, rate_hz, policy, priority) and "round_trips" (address, port,
+        request: "sudo", whether it may be asked; "wake_ups" (count, rate_hz, policy, priority) and "round_trips" (address, port,
             nonce_hex, count), each null to leave it out; "root", "runs", "environments" and "state", the
             folders of COSMoS here; "interface", where the one that the operator came by is not the one
             that matters; "etc", "sys" and "proc", where others than the system's are meant.
@@ -43,7 +43,7 @@ def doctor(request: VerbRequest) -> dict[str, PlainValue]:
     asked = request.arguments
     sys_, proc = (asked.get(key) or f"/{key}" for key in ("sys", "proc"))
     named = {key: asked[key] for key in ("root", "etc", "sys", "proc") if asked.get(key)}
-    found = facts(VerbRequest(arguments={**named, "sudo": True}))
+    found = facts(VerbRequest(arguments={**named, "sudo": bool(asked.get("sudo"))}))
     connected = asked.get("interface") or found["network"].get("interface")
     drops_before, interfaces_before = receive_drops(proc), interfaces(sys_, connected)
     before = look(proc)

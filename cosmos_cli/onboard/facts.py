@@ -100,7 +100,7 @@ def facts(request: VerbRequest) -> dict[str, PlainValue]:
         ).split(),
         "radios": _radios(sys_),
         "uses_pam": _uses_pam(etc) if asked.get("is_pam_asked") else None,
-        "services": {name: _service(name) for name in asked.get("services") or ()},
+        "services": {name: service_state(name) for name in asked.get("services") or ()},
         **look(request),
         "packages": _packages(asked.get("packages") or ()),
         **(_end_sudo(sudo) if is_sudo_asked else {"sudo": None, "sudo_refusal": None}),
@@ -308,8 +308,7 @@ def _file(path: str, how: str) -> dict[str, PlainValue]:
 
 def _packages(names: Sequence[str]) -> dict[str, str | None]:
     """Tell the installed version of each package; what changes packages is in `apt`, and is heavier."""
-    said = _output([*DPKG_QUERY, *names], TOOL_TIMEOUT_S) if names else ""
-    found = versions_of(said)
+    found = versions_of(_output([*DPKG_QUERY, *names], TOOL_TIMEOUT_S) if names else "")
     return {name: found.get(name) for name in names}
 
 
@@ -324,7 +323,8 @@ def versions_of(said: str) -> dict[str, str]:
     return found
 
 
-def _service(name: str) -> dict[str, str]:
+def service_state(name: str) -> dict[str, str]:
+    """Return what systemd says of a unit: "enabled" and "active", each a word of its own, or "unknown"."""
     asks = {"enabled": "is-enabled", "active": "is-active"}
     return {
         key: _output(["systemctl", ask, name], TOOL_TIMEOUT_S).strip() or "unknown"

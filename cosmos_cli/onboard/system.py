@@ -14,7 +14,7 @@ import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
 
-from cosmos_cli.onboard.facts import is_done
+from cosmos_cli.onboard.facts import is_done, service_state
 from cosmos_cli.onboard.request_loop import (
     AnswerPart,
     HelperRefusal,
@@ -146,9 +146,34 @@ def _succeeding(
 
 @verb("service")
 def service(request: VerbRequest) -> Iterator[AnswerPart]:
-    """Have systemd do things with one service: "do" holds enable, disable, start, stop."""
+    """
+    Have systemd do things with one service: "do" holds enable, disable, start, stop.
+
+    With "may_be_new" the plan knew of no such unit: what is so by now, or is not there, is left alone. The last part
+    tells what it "did".
+    """
     asked = request.arguments
-    reload = [["daemon-reload"]] if asked.get("reload") else []
-    for words in [*reload, *([word, asked["name"]] for word in asked.get("do") or ())]:
-        name = f"systemctl {' '.join(words)}"
-        yield from _succeeding(["systemctl", *words], name, timeout_s=asked["timeout_s"])
+    name, timeout_s = asked["name"] if asked.get("do") else "", asked["timeout_s"]
+    did = []
+    if asked.get("reload"):
+        yield from _systemctl("daemon-reload", timeout_s=timeout_s)
+    state = service_state(name) if asked.get("may_be_new") else {}
+    for word in asked.get("do") or ():
+        if not state or state[_STATE_OF[word]] in _UNDONE[word]:
+            yield from _systemctl(word, name, timeout_s=timeout_s)
+            did.append(word)
+    yield AnswerPart(value={"did": did if asked.get("do") else ["daemon-reload"]})
+
+
+def _systemctl(*words: str, timeout_s: float) -> Iterator[AnswerPart]:
+    yield from _succeeding(
+        ["systemctl", *words], f"systemctl {' '.join(words)}", timeout_s=timeout_s
+    )
+
+
+_STATE_OF = {"disable": "enabled", "stop": "active"}
+_UNDONE = {
+    "disable": ("enabled", "enabled-runtime", "linked", "linked-runtime"),
+    "stop": ("active", "reloading", "activating"),
+}
+"""Words of systemd for a unit of which that is still to be done."""

@@ -99,7 +99,7 @@ _CHANGES: Mapping[str, Callable[[Any], Any]] = {
     "packages": lambda value: value.get("changes"),
     "command": lambda value: value.get("ran"),
     "prune_installed": lambda value: any(value.values()),
-    "service": lambda value: True,
+    "service": lambda value: value.get("did"),
     "set_values": lambda value: True,
 }
 """Whether the answer of a verb tells of a change; of other verbs the answer itself does."""

@@ -11,6 +11,7 @@ from typing import Any
 from cosmos_cli.fleet.answers.verbs import failure_of
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.fleet.target import ROOT_FORBIDDEN
 from cosmos_cli.models.machine_facts import MachineFacts, files_of
 from cosmos_cli.provision.desired import DesiredState, questions
 from cosmos_cli.provision.steps import installed_question
@@ -78,7 +79,9 @@ def gather_facts(
     )
     facts = _with_installed(facts, installed["value"])
     if not may_become_root:
-        return dataclasses.replace(facts, can_become_root=False), others
+        is_root = facts.uid == 0  # needs no sudo
+        refusal = "" if is_root else ROOT_FORBIDDEN
+        return dataclasses.replace(facts, can_become_root=is_root, sudo_refusal=refusal), others
     return _with_root(board, facts, calls[0]["arguments"]), others
 
 

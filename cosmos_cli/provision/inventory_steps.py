@@ -50,6 +50,7 @@ ENABLED = frozenset({"enabled", "enabled-runtime", "static", "alias", "indirect"
 DISABLED = frozenset(
     {"disabled", "static", "alias", "indirect", "generated", "masked", "not-found", "unknown"}
 )
+NOT_THERE = frozenset({"not-found", "unknown"})
 RUNNING = frozenset({"active", "reloading", "activating"})
 
 
@@ -299,16 +300,20 @@ def _service(declared: DeclaredStep, facts: MachineFacts, sketch: Sketch) -> Ite
     assert isinstance(action, SystemdService)
     found = facts.services.get(action.name)
     enabled, active = (found.enabled, found.active) if found else ("unknown", "unknown")
+    # A package, or a command, may bring the unit, and start it at once.
+    may_be_new = sketch.may_bring_files and enabled in NOT_THERE
     wishes = {
         "enable": action.enabled is True and enabled not in ENABLED,
-        "disable": action.enabled is False and enabled not in DISABLED,
+        "disable": action.enabled is False and (may_be_new or enabled not in DISABLED),
         "start": action.state == "started" and active not in RUNNING,
-        "stop": action.state == "stopped" and active in RUNNING,
+        "stop": action.state == "stopped" and (may_be_new or active in RUNNING),
     }
     do = [word for word, is_wanted in wishes.items() if is_wanted]
     if do:
-        asked = {"name": action.name, "do": do, "reload": True}
-        yield _service_step(f"service {action.name}: {', '.join(do)}", asked, declared)
+        is_doubtful = may_be_new and not {"enable", "start"} & set(do)
+        asked = {"name": action.name, "do": do, "reload": True, "may_be_new": is_doubtful}
+        also = ", if it is there by then" if is_doubtful else ""
+        yield _service_step(f"service {action.name}: {', '.join(do)}{also}", asked, declared)
 
 
 def _service_step(title: str, asked: Mapping[str, Any], declared: DeclaredStep) -> Step:

@@ -15,7 +15,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import uv
@@ -46,6 +46,8 @@ NO_NETWORK = re.compile(
 )
 NO_ROOM = re.compile(r"no space left on device|disk quota exceeded", re.IGNORECASE)
 SECRET = re.compile(r"://[^/@\s]+@")
+NOBODYS_PROJECT = '[project]\nname = "nobody"\nversion = "0"\n[tool.uv.workspace]\n'
+"""Else uv heeds that of the present folder, or of one above it, and what it finds is remembered for all folders."""
 EXTRA_INDEXES = ("UV_INDEX", "UV_EXTRA_INDEX_URL")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
 
@@ -67,12 +69,13 @@ def resolve(requirements: Sequence[str], platform: Platform) -> tuple[Candidate,
     settings = pip_settings()
     if settings.get("no-index") in ("1", "true", "yes", "on"):
         command.append("--no-index")
-    done = _run(
-        command,
-        timeout_s=RESOLVE_TIMEOUT_S,
-        stdin="\n".join([*index_lines(settings, os.environ), *requirements]),
-        environment=uv_environment(settings, os.environ),
-    )
+    with _private_file("pyproject.toml", NOBODYS_PROJECT) as project:
+        done = _run(
+            [command[0], "--project", str(project.parent), *command[1:]],
+            timeout_s=RESOLVE_TIMEOUT_S,
+            stdin="\n".join([*index_lines(settings, os.environ), *requirements]),
+            environment=uv_environment(settings, os.environ),
+        )
     if done.returncode:
         raise _resolve_failure(done.stderr, requirements, platform)
     return parse_pylock(done.stdout, platform)
@@ -85,9 +88,8 @@ def download(chosen: Sequence[Chosen], folder: Path, platform: Platform) -> None
     Raises:
         MachineFailure: The index cannot be reached, or what it gave is not what was decided on.
     """
-    with tempfile.TemporaryDirectory(prefix="cosmos-") as private:
-        wanted = Path(private, "wheels.txt")  # not in argv: an address may hold a password
-        wanted.write_text("".join(f"{_pin(each)}\n" for each in chosen))
+    pins = "".join(f"{_pin(each)}\n" for each in chosen)
+    with _private_file("wheels.txt", pins) as wanted:  # not in argv: an address may hold a password
         command = [*PIP, "download", "--quiet", "--no-deps", "--require-hashes"]
         command += ["--requirement", str(wanted), "--dest", str(folder), *_pip_platform(platform)]
         done = _run(command, timeout_s=DOWNLOAD_TIMEOUT_S, environment=pip_environment(os.environ))
@@ -244,11 +246,33 @@ def _resolve_failure(said: str, requirements: Sequence[str], platform: Platform)
     )
 
 
+@contextlib.contextmanager
+def _private_file(name: str, text: str) -> Iterator[Path]:
+    """
+    Keep a file in a folder of its own that nobody else may enter, and that goes.
+
+    Raises:
+        MachineFailure: DISK_FULL, this computer has no room for it.
+    """
+    with contextlib.ExitStack() as kept:
+        try:
+            folder = kept.enter_context(tempfile.TemporaryDirectory(prefix="cosmos-"))
+            path = Path(folder, name)
+            path.write_text(text)
+        except OSError as error:  # FileNotFoundError, where no folder for such files takes one
+            raise _without_room(error.strerror or str(error)) from None
+        yield path
+
+
 def _no_room(said: str) -> MachineFailure:
     line = next(line for line in said.splitlines() if NO_ROOM.search(line))
+    return _without_room(last_lines(line.strip()))
+
+
+def _without_room(said: str) -> MachineFailure:
     return MachineFailure(
         FailureKind.DISK_FULL,
-        f"no room on this computer for what machines need: {last_lines(line.strip())}",
+        f"no room on this computer for what machines need: {said}",
         f"make room where that is, or name other folders with {CACHE_VARIABLE} (wheels), UV_CACHE_DIR and TMPDIR",
     )
 

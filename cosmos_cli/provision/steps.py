@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.target import ROOT_FORBIDDEN
 from cosmos_cli.models.machine_facts import NOEXEC_CURE, MachineFacts
 from cosmos_cli.provision.desired import DesiredState
 from cosmos_cli.provision.device_steps import boot_notes, device_steps
@@ -80,14 +81,21 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     if rooted and facts.can_become_root is False:
         shown = "; ".join(rooted[:TITLES_SHOWN_MAX])
         more = len(rooted) - TITLES_SHOWN_MAX
-        said = f" ({facts.sudo_refusal})" if facts.sudo_refusal else ""
-        raise MachineFailure(
-            FailureKind.NO_SUDO,
-            f"{facts.user} cannot become root without a password{said}, which is needed for: {shown}"
-            + (f"; and {more} more" if more > 0 else ""),
-            "let the user run sudo without one (a file in /etc/sudoers.d), or take what needs root"
-            " out of the inventory",
-        )
+        shown += f"; and {more} more" if more > 0 else ""
+        why, cure = _root_refusal(facts)
+        raise MachineFailure(FailureKind.NO_SUDO, f"{why}, which is needed for: {shown}", cure)
+
+
+def _root_refusal(facts: MachineFacts) -> tuple[str, str]:
+    """Return why nobody becomes root there, and what to do."""
+    if facts.sudo_refusal == ROOT_FORBIDDEN:
+        return ROOT_FORBIDDEN, "take what needs root out of the inventory, or ansible_become: false"
+    said = f" ({facts.sudo_refusal})" if facts.sudo_refusal else ""
+    return (
+        f"{facts.user} cannot become root without a password{said}",
+        "let the user run sudo without one (a file in /etc/sudoers.d), or take what needs root"
+        " out of the inventory",
+    )
 
 
 def megabytes(size_bytes: int) -> str:

@@ -91,6 +91,7 @@ def test_process_of_an_agent_with_an_endless_name_is_still_listed():
     ("variables", "expected"),
     [
         ({"COSMOS_STATE_DIR": "/x"}, "/x/processes"),
+        ({"COSMOS_STATE_DIR": "~/x", "HOME": "/home/pi"}, "/home/pi/x/processes"),
         ({"XDG_STATE_HOME": "/y"}, "/y/cosmos/processes"),
         ({"HOME": "/home/pi"}, "/home/pi/.local/state/cosmos/processes"),
     ],

@@ -317,7 +317,7 @@ _ANSWERS: Mapping[str, Callable[[Asked], Shape]] = {
         record({"is_there": flag, "bytes": map_of(size), "others": names, "living": names})
     ),
     "sample_devices": _always(record({}, {"is_running": flag, "said": text(), "file": name})),
-    "service": _always(record({}, {"is_running": flag})),
+    "service": _always(record({}, {"is_running": flag, "did": names})),
     "set_values": _always(nothing),
     "several": _several,
     "sizes": _always(record({}, {"gone": flag, "sizes": list_of(row([name, size]))})),

@@ -58,7 +58,7 @@ INPUT_POLL_S = 0.005
 QUIET_S = 5.0
 """After so long without output of a command its machine is asked for a sign of life."""
 NO_CHANNEL = "Timeout opening channel."
-"""Words of paramiko where the other side gives none."""
+"""Text of paramiko where the other side says nothing."""
 LIMITS_POLL_S = 0.25
 """Between looks at the limits of a command that writes to standard error alone, or nothing."""
 

@@ -190,7 +190,7 @@ def host_key_failure(
         return MachineFailure(
             FailureKind.HOST_KEY_UNKNOWN,
             f"{where}: its host key is not known: {shown}",
-            "compare it with `ssh-keygen -lf /etc/ssh/ssh_host_*_key.pub` there, then record it with"
+            "compare it with `cat /etc/ssh/ssh_host_*_key.pub | ssh-keygen -lf -` there, then record it with"
             " --accept-new-host-keys, or log in once with ssh",
         )
     old = verdict.against

@@ -291,6 +291,24 @@ def test_this_computer_can_be_probed_and_is_left_as_it_was(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.process
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("is_allowed", [True, False])
+def test_sudo_is_asked_unless_the_inventory_forbids_it(tmp_path: Path, is_allowed: bool) -> None:
+    target = Target(
+        name="pi01",
+        address="127.0.0.1",
+        connection="local",
+        root=str(tmp_path),
+        may_become_root=is_allowed,
+    )
+
+    facts = probed(LocalConnection(target))["facts"]
+
+    assert isinstance(facts, dict)
+    assert (facts["sudo"] is not None) is is_allowed
+
+
 @pytest.mark.root
 @pytest.mark.usefixtures("quick")
 @pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user")

@@ -258,3 +258,11 @@ def test_number_of_a_living_run_is_not_given_again_when_its_folder_is_deleted(tm
         assert create_run(tmp_path / "runs", "a").name == "0002-a"
         assert create_run(tmp_path / "elsewhere", "a").name == "0001-a"
     assert create_run(tmp_path / "third", "a").name == "0001-a"
+
+
+def test_folder_of_all_runs_may_be_said_from_the_home(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("COSMOS_RUNS", "~/of-a-variable")
+
+    assert runs_root() == tmp_path / "of-a-variable"
+    assert runs_root("~/of-an-option") == tmp_path / "of-an-option"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -43,6 +44,7 @@ class PlayedBoard:
     """Answers as told; what it was asked is in `asked`."""
 
     living: Sequence[dict[str, str]] = ()
+    greeting: dict[str, int] = {"uid": 1000}  # noqa: RUF012 - replaced, never changed
     failures: dict[str, MachineFailure]
     asked: list[str]
 
@@ -124,6 +126,24 @@ def test_refused_order_is_the_machines_failure(board: type[PlayedBoard]) -> None
 
     with pytest.raises(MachineFailure, match="a password is required"):
         rebooting("new").reboot(PlayedConnection())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("uid", "is_done"), [(1000, False), (0, True)])
+def test_sudo_that_the_inventory_forbids_is_not_used(
+    board: type[PlayedBoard], uid: int, is_done: bool
+) -> None:
+    connection = PlayedConnection()
+    connection.target = dataclasses.replace(TARGET, may_become_root=False)
+    board.greeting = {"uid": uid}
+
+    if is_done:  # who logs in is root already
+        assert rebooting("new").reboot(connection).boot_id == "new"  # type: ignore[arg-type]
+        return
+    with pytest.raises(MachineFailure, match="ansible_become: false") as failure:
+        rebooting("new").reboot(connection)  # type: ignore[arg-type]
+
+    assert failure.value.kind is FailureKind.NO_SUDO
+    assert "reboot" not in board.asked
 
 
 def test_machine_with_a_run_is_left_to_it(board: type[PlayedBoard]) -> None:

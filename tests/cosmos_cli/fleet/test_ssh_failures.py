@@ -1,7 +1,10 @@
 """Every way in which a connection fails, in words that say what to do."""
 
 import errno
+import re
+import shutil
 import socket
+import subprocess
 
 import pytest
 from paramiko.ssh_exception import (
@@ -178,3 +181,24 @@ def test_jump_host_that_may_not_is_told_from_one_that_does_not_reach_it():
 def test_lost_connection_is_told_with_its_cause():
     assert lost(OSError("reset")).text == "the connection is lost (reset)"
     assert FailureKind.LOST is lost().kind
+
+
+@pytest.mark.process
+def test_command_that_shows_a_machines_fingerprints_shows_all_of_its_keys(tmp_path):
+    """Most machines have three keys, and ssh-keygen takes one file."""
+    if shutil.which("ssh-keygen") is None:
+        pytest.skip("needs ssh-keygen")
+    for kind in ("ed25519", "ecdsa"):
+        path = tmp_path / f"ssh_host_{kind}_key"
+        subprocess.run(["ssh-keygen", "-q", "-t", kind, "-N", "", "-f", str(path)], check=True)
+    failure = host_key_failure(KeyVerdict(standing=Standing.UNKNOWN), KEY, ("pi",), WHERE)
+    (command,) = re.findall("`([^`]*ssh-keygen[^`]*)`", failure.advice)
+
+    done = subprocess.run(
+        ["/bin/sh", "-c", command.replace("/etc/ssh", str(tmp_path))],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    assert done.stdout.count("SHA256:") == 2

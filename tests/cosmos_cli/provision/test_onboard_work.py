@@ -215,6 +215,45 @@ def test_condition_of_a_command_finds_the_programs_that_the_command_finds(tmp_pa
         assert board.call("look", asked).value["conditions"] == {"it": True}
 
 
+SYSTEMCTL = r"""#!/bin/sh
+echo "$*" >> "$0.asked"
+case "$1" in is-enabled) echo "$ENABLED" ;; is-active) echo "$ACTIVE" ;; esac
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("enabled", "active", "did"),
+    [
+        ("enabled", "active", ["disable", "stop"]),
+        ("enabled", "inactive", ["disable"]),
+        ("disabled", "active", ["stop"]),
+        ("not-found", "inactive", []),
+        ("", "", []),
+    ],
+)
+def test_service_that_may_have_come_is_stopped_where_it_runs(
+    tmp_path, monkeypatch, enabled, active, did
+):
+    """One that no package has brought cannot be: systemctl would fail."""
+    systemctl = tmp_path / "systemctl"
+    systemctl.write_text(SYSTEMCTL)
+    systemctl.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setenv("ENABLED", enabled)
+    monkeypatch.setenv("ACTIVE", active)
+    asked = {"name": "a", "do": ["disable", "stop"], "reload": True, "may_be_new": True}
+
+    *_, last = system.service(VerbRequest(arguments={**asked, "timeout_s": PATIENCE_S}))
+
+    lines = Path(f"{systemctl}.asked").read_text().splitlines()
+    assert last.value == {"did": did}
+    assert [line for line in lines if not line.startswith("is-")] == [
+        "daemon-reload",
+        *(f"{word} a" for word in did),
+    ]
+
+
 @pytest.mark.process
 def test_command_that_takes_too_long_is_ended_with_its_children(tmp_path):
     asked = {"run": f"sleep 1000 & echo $! > {tmp_path}/pid; wait", "creates": f"{tmp_path}/a"}

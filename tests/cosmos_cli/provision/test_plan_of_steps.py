@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 from provision_machines import CASES, HOME, facts_of, told, wanted
@@ -12,6 +13,7 @@ from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.models.machine_facts import MachineFacts
 from cosmos_cli.onboard.facts import _file
 from cosmos_cli.onboard.files import replace_file
+from cosmos_cli.provision.gather_facts import gather_facts
 from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, notes_of, plan_steps
 from cosmos_cli.provision.up import MachineUp, UpOptions
 from cosmos_cli.provision.up_table import MachineResult
@@ -146,6 +148,28 @@ def test_plan_that_needs_root_is_refused_with_its_steps_where_nobody_becomes_roo
         " setting cosmos_wifi: on -> off; setting cosmos_bluetooth: on -> off",
     )
     check_possible(facts_of(sudo=True), ROOTED)
+
+
+@pytest.mark.parametrize(("uid", "can"), [(1000, False), (0, True)])
+def test_inventory_that_forbids_sudo_is_blamed_and_root_needs_none(uid, can):
+    nothing = {"trees": {}, "environments": {}}
+    answers = [{"ok": True, "value": value} for value in (told(user={"id": uid}), nothing)]
+    board = SimpleNamespace(call=lambda *asked, **how: SimpleNamespace(value=answers))
+
+    facts, _ = gather_facts(board, [{"arguments": {}}] * 2, may_become_root=False)
+
+    assert facts.can_become_root is can
+    if can:
+        check_possible(facts, ROOTED)
+        return
+    with pytest.raises(MachineFailure) as caught:
+        check_possible(facts, ROOTED)
+    assert caught.value.kind.value == "no_sudo"
+    assert caught.value.text == (
+        "the inventory forbids to become root there (ansible_become: false), which is needed for:"
+        " setting cosmos_wifi: on -> off; setting cosmos_bluetooth: on -> off"
+    )
+    assert "ansible_become" in caught.value.advice
 
 
 def test_plan_that_needs_root_is_refused_with_what_sudo_says_of_it():

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 
@@ -344,6 +345,31 @@ def test_older_version_is_taken_when_it_is_asked_for(index, requirement):
     make_source(index, "lgpio", "0.2.2.0")
 
     assert "lgpio-0.0.0.2-py3-none-any.whl" in filenames(prepare(PI, [requirement]))
+
+
+def test_computer_without_room_for_a_temporary_file_is_told_as_such(index, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/proc", "/sys"])
+
+    failure = refused(PI, [])
+
+    assert failure.kind is FailureKind.DISK_FULL
+    assert "no room on this computer" in failure.text
+    assert "TMPDIR" in failure.advice
+
+
+def test_project_of_the_present_folder_decides_on_no_version(index, tmp_path, monkeypatch):
+    """What is resolved is remembered for all folders, whatever a pyproject.toml for uv says in one."""
+    make_wheel(index, "pyproj", "3.0")
+    make_wheel(index, "pyproj", "4.0")
+    project = tmp_path / "project"
+    (project / "inner").mkdir(parents=True)
+    (project / "pyproject.toml").write_text(
+        '[project]\nname = "own"\nversion = "1"\n[tool.uv]\noverride-dependencies = ["pyproj<4"]\n'
+    )
+    monkeypatch.chdir(project / "inner")
+
+    assert "pyproj-4.0-py3-none-any.whl" in filenames(prepare(PI, ["pyproj"]))
 
 
 def test_unknown_package_and_conflict_are_told_in_the_resolvers_words(index):
