@@ -3,6 +3,8 @@ import errno
 import os
 import shutil
 import tarfile
+import tempfile
+from pathlib import Path
 
 import orjson
 import pyarrow.parquet as pq
@@ -13,6 +15,7 @@ from harness.synthetic_run import SyntheticRun, make_config
 
 from cosmos_cli.collect import finish as finish_module
 from cosmos_cli.collect.finish import collect_run, finish_run
+from cosmos_cli.diff.recorded import recorded_streams
 from cosmos_cli.errors import InputError, RunFailedError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import Problem
@@ -50,6 +53,38 @@ def test_whole_run_is_green_and_leaves_all_its_evidence(tmp_path):
     assert made.run.report_html.exists()
     assert made.run.bundle.exists()
     assert not made.run.reserve.exists()
+
+
+@pytest.fixture
+def ordinary():
+    """A run of a user who is not root, whom modes of folders bind; the test acts for that user."""
+    folder = Path(tempfile.mkdtemp(prefix="cosmos-ordinary-"))
+    made = SyntheticRun(folder / "runs").write()
+    finish(made)
+    is_root = os.geteuid() == 0
+    if is_root:
+        for path in (folder, *folder.rglob("*")):
+            os.chown(path, 65534, 65534)
+        os.setegid(65534)
+        os.seteuid(65534)
+    yield made
+    if is_root:
+        os.seteuid(0)
+        os.setegid(0)
+    for path in made.run.path.rglob("*"):
+        path.chmod(0o700)
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("name", ["agents/agent-01", "tables"])
+def test_a_folder_of_which_the_names_alone_may_be_read_is_told(ordinary, name):
+    (ordinary.run.path / name).chmod(0o444)
+
+    summary = collect_run(ordinary.run, processes=lambda: [])
+
+    assert summary.exit_code == 5
+    assert f"{name}: not read: Permission denied" in summary.missing
+    assert recorded_streams(ordinary.run)
 
 
 def test_run_json_holds_every_promised_key(tmp_path):
