@@ -87,6 +87,18 @@ def test_a_folder_of_which_the_names_alone_may_be_read_is_told(ordinary, name):
     assert recorded_streams(ordinary.run)
 
 
+@pytest.mark.parametrize("name", ["agents/agent-01/ticks.jsonl", "scenario.yaml"])
+def test_a_file_that_may_not_be_read_is_told_and_the_rest_is_judged(ordinary, name):
+    (ordinary.run.path / name).touch()
+    (ordinary.run.path / name).chmod(0)
+
+    summary = collect_run(ordinary.run, processes=lambda: [])
+
+    assert summary.exit_code == 5
+    assert f"{name}: not read: Permission denied" in summary.missing
+    assert summary.is_packed
+
+
 def test_run_json_holds_every_promised_key(tmp_path):
     made = SyntheticRun(tmp_path).write()
 
