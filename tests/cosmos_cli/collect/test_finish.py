@@ -20,6 +20,7 @@ from cosmos_cli.errors import InputError, RunFailedError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import Problem
 from madns_runtime.config import Deadline
+from madns_runtime.recording.reader import StreamReading
 from madns_runtime.recording.records import EVENTS, TICKS
 
 
@@ -96,6 +97,28 @@ def test_a_file_that_may_not_be_read_is_told_and_the_rest_is_judged(ordinary, na
 
     assert summary.exit_code == 5
     assert f"{name}: not read: Permission denied" in summary.missing
+    assert summary.is_packed
+
+
+def test_a_stream_on_a_bad_disk_is_told_and_the_rest_is_judged_and_packaged(tmp_path, monkeypatch):
+    made = SyntheticRun(tmp_path).write()
+    finish(made)
+    bad = made.stream("agent-01", "ticks")
+    chunks = StreamReading.column_chunks
+
+    def breaking(self):
+        if self.path == bad:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return chunks(self)
+
+    monkeypatch.setattr(StreamReading, "column_chunks", breaking)
+
+    summary = collect_run(made.run, processes=lambda: [])
+
+    assert summary.exit_code == 5
+    assert "agents/agent-01/ticks.jsonl: cannot be read: Input/output error" in summary.missing
+    assert any(line.startswith("agent-01: ticks is missing") for line in summary.missing)
+    assert summary.document["records"]["written"] > 0
     assert summary.is_packed
 
 
