@@ -14,6 +14,7 @@ from harness import full_disk
 from harness.synthetic_run import SyntheticRun, make_config
 
 from cosmos_cli.collect import finish as finish_module
+from cosmos_cli.collect import previous_manifest
 from cosmos_cli.collect.finish import collect_run, finish_run
 from cosmos_cli.diff.recorded import recorded_streams
 from cosmos_cli.errors import InputError, RunFailedError
@@ -120,6 +121,30 @@ def test_a_stream_on_a_bad_disk_is_told_and_the_rest_is_judged_and_packaged(tmp_
     assert any(line.startswith("agent-01: ticks is missing") for line in summary.missing)
     assert summary.document["records"]["written"] > 0
     assert summary.is_packed
+
+
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [
+        (errno.EIO, "cannot be read: Input/output error"),
+        (errno.ENOENT, "missing; it was there when the run was collected"),
+    ],
+)
+def test_a_file_that_cannot_be_read_when_a_run_is_collected_again_is_told(
+    tmp_path, monkeypatch, number, told
+):
+    made = SyntheticRun(tmp_path).write()
+    (made.run.path / "notes.txt").write_text("seen")
+    finish(made)
+
+    def broken(path):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(previous_manifest, "file_entry", broken)
+
+    summary = collect_run(made.run, processes=lambda: [])
+
+    assert f"notes.txt: {told}" in summary.missing
 
 
 def test_run_json_holds_every_promised_key(tmp_path):
