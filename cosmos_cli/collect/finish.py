@@ -110,7 +110,6 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
         bytes_max: The most that files with holes may hold and be read; None for what the plan allows.
 
     Raises:
-        MachineError: A record stream cannot be read.
         RunFailedError: Not even run.json can be written.
     """
     _remove_sockets(run)
@@ -132,7 +131,7 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
         without=unread,
     )
     gathered = dataclasses.replace(gathered, scans=with_told_counts(gathered.scans, result))
-    changed |= earlier.changed_streams(run, gathered.by_path(), unread)
+    changed |= earlier.changed_streams(run, gathered.by_path(), gathered.unread)
     fault = fault_of_plan(run.plan_json)
     if fault is not None:
         changed.setdefault(run.plan_json.name, f"{fault}; what was planned is not known")
@@ -180,7 +179,6 @@ def collect_run(
 
     Raises:
         InputError: Processes of the run still live; the message names them.
-        MachineError: A record stream cannot be read.
         RunFailedError: Not even run.json can be written.
     """
     refuse_living(run, processes())

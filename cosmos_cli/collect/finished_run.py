@@ -52,7 +52,7 @@ def refuse_foreign_tables(run: RunDirectory) -> None:
     """
     listed = mapping_at(run.read_json(run.manifest_json), "files")
     for path in sorted(run.tables.glob("*.parquet")) if listed else ():
-        is_read = path.is_file() and not path.is_symlink()
+        is_read = os.path.isfile(path) and not path.is_symlink()
         if is_read and f"{run.tables.name}/{path.name}" not in listed:
             raise InputError(
                 f"{path}: no collection made it, and its values would pass for the run's; remove it, or have it noted"

@@ -25,6 +25,7 @@ MADE_ANEW = ("run.json", "report.html", "manifest.json")
 TABLES = "tables/"
 MACHINES = "machines/"
 WAS = "was"
+UNREADABLE = "unreadable"
 NOT_KNOWN = "what has changed since it was written is not known"
 
 
@@ -102,11 +103,20 @@ def is_there(run: RunDirectory, name: str) -> bool:
 
 
 def _entry_now(run: RunDirectory, name: str) -> Mapping[str, Any] | None:
-    """Return the entry of a file of the run, empty of a link, which is neither read nor packaged; None if it is gone."""
+    """
+    Return the entry of a file of the run, empty of a link, which is neither read nor packaged; None if it is gone.
+
+    Of one that cannot be read it says why, under UNREADABLE.
+    """
     if not is_there(run, name):
         return None
     path = run.path / name
-    return {} if is_linked(path, run.path) else file_entry(path)
+    try:
+        return {} if is_linked(path, run.path) else file_entry(path)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        return {UNREADABLE: error.strerror or str(error)}
 
 
 def _is_made_anew(name: str) -> bool:
@@ -124,6 +134,8 @@ def _change(now: Mapping[str, Any] | None, was: Mapping[str, Any]) -> str:
         return "missing; it was there when the run was collected"
     if not now:
         return "a link, which is not followed; it was there when the run was collected"
+    if UNREADABLE in now:
+        return f"cannot be read: {now[UNREADABLE]}"
     if now["sha256"] == was.get("sha256"):
         return ""
     has_others = "records" in was and now.get("records", was["records"]) != was["records"]

@@ -1,5 +1,5 @@
 """
-Files of a run on this computer that are not read: they claim more than the run can have recorded, or have no name in text.
+Files of a run on this computer that are not read: larger than the run can have recorded, without a name in text, or denied.
 
 A file with holes, such as a core dump, may say to be larger than any disk, and would be hashed and packed
 without end. A file without holes is bounded by the disk, and is read however large.
@@ -7,6 +7,7 @@ without end. A file without holes is bounded by the disk, and is read however la
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -44,6 +45,8 @@ def find_unread(
         if not _is_text(str(path))
     }
     found |= {path: f"not read: {error.strerror}" for path, error in unreadable_places(run).items()}
+    denied = f"not read: {os.strerror(errno.EACCES)}"
+    found |= {path: denied for path in run_files(run) if not _may_read(path)}
     for path in sorted(sizes, key=lambda path: (-sizes[path], path)):
         if total <= bytes_max:
             break
@@ -68,6 +71,10 @@ def _sizes_with_holes(run: RunDirectory, known: Mapping[str, Mapping[str, Any]])
         if has_holes and entry.get("bytes") != found.st_size:
             sizes[path] = found.st_size
     return sizes
+
+
+def _may_read(path: Path) -> bool:
+    return os.access(path, os.R_OK, effective_ids=os.access in os.supports_effective_ids)
 
 
 def _is_text(name: str) -> bool:

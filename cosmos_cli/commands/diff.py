@@ -23,6 +23,7 @@ from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.system.named_file import named_file
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
@@ -112,10 +113,8 @@ def _tell(console: Console, comparisons: Sequence[Comparison], html: Path | None
     for comparison in comparisons:
         print_comparison(console, comparison)
     if html is not None:
-        try:
+        with named_file(html):
             write_comparisons(comparisons, html)
-        except OSError as error:
-            raise InputError(f"{html}: cannot be written: {error.strerror or error}") from error
         console.say(f"comparison written to {html}")
     elif figures := sum(map(count_figures, comparisons)):
         console.say(f"{counted(figures, 'figure')} more with --html FILE")
@@ -128,11 +127,9 @@ def _check_replaceable(path: Path) -> None:
     Raises:
         InputError: It could not.
     """
-    try:
+    with named_file(path):
         check_replaceable(path)
         path.parent.stat()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def _overrides(set_: list[str] | None, duration_s: float | None) -> list[str]:

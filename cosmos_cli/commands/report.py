@@ -20,6 +20,7 @@ from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.report.build import build_sections, with_simulation
 from cosmos_cli.report.html import write_report
 from cosmos_cli.report.terminal import print_report
+from cosmos_cli.system.named_file import named_file
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from madns_runtime.partial_file import check_replaceable
 
@@ -49,11 +50,9 @@ def report(
     if as_json:
         console.print_json(with_simulation(found, document, console.warn))
     if html is not None:
-        try:
+        with named_file(html):
             check_replaceable(html)
             console.say(f"report written to {write_report(found, document, html)}")
-        except OSError as error:
-            raise InputError(f"{html}: cannot be written: {error.strerror or error}") from error
     elif not as_json:
         print_report(console, document, build_sections(found, document))
         if found.report_html.is_file():

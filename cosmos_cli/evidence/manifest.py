@@ -31,7 +31,7 @@ def run_files(run: RunDirectory, without: Container[Path] = ()) -> Iterator[Path
     """Yield the files that are evidence, in the order of their names; no reserve, nothing half-written."""
     for path in sorted(path for path, error in _below(run.path) if error is None):
         is_left_out = path in without or path.name == RESERVE_NAME or path.name.endswith(".part")
-        if path.is_file() and not path.is_symlink() and not is_left_out:
+        if os.path.isfile(path) and not path.is_symlink() and not is_left_out:
             yield path
 
 
@@ -46,6 +46,9 @@ def _below(folder: Path) -> Iterator[tuple[Path, OSError | None]]:
     while waiting:
         here = waiting.pop()
         try:
+            os.stat(
+                os.path.join(here, ".")
+            )  # its names may be listed, and nothing of them be looked at
             with os.scandir(here) as entries:
                 for entry in entries:
                     path = Path(entry.path)

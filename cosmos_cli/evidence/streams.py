@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -143,7 +144,7 @@ def find_streams(run_path: Path, runs: Collection[str] = ()) -> list[RecordFile]
         open_stream_file(path, role, runs)
         for role, folder in places
         for path in run_path.glob(f"{folder}/*{SUFFIX}")
-        if path.is_file() and not is_linked(path, run_path)
+        if os.path.isfile(path) and not is_linked(path, run_path)
     ]
     return sorted(found, key=_order)
 

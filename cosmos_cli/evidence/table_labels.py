@@ -63,7 +63,8 @@ class TableLabels:
         """Return microseconds since 1970 UTC at simulated times, shape (N,), s; NEVER_US where there is no time."""
         assert self.zero_utc is not None
         zero_us = round(self.zero_utc.timestamp() * US_PER_S)
-        after_us = t_s * US_PER_S
+        with np.errstate(over="ignore"):  # of what diverged
+            after_us = t_s * US_PER_S
         is_time = np.abs(after_us) < YEARS_US  # false for NaN
         whole = np.where(is_time, np.rint(np.where(is_time, after_us, 0.0)), 0.0).astype(np.int64)
         return np.where(is_time, zero_us + whole, NEVER_US)

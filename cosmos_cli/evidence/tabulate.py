@@ -23,6 +23,7 @@ from cosmos_cli.evidence.streams import (
 )
 from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.evidence.tables import NO_LABELS, TableLayout, TableWriter, plan_table
+from madns_runtime.errors import MachineError
 
 Progress = Callable[[str, float], None]
 """Takes what is being done and how far it is, 0 to 1."""
@@ -59,10 +60,8 @@ def gather(
     """
     Read every stream of a run but those *without*, once, and write its table, with *labels* beside each record.
 
-    A table that cannot be written, as on a full disk, is reported; counting goes on.
-
-    Raises:
-        MachineError: A stream cannot be read.
+    A table that cannot be written, as on a full disk, is reported, as is a stream that cannot be read, as on a bad one;
+    counting goes on.
     """
     config = run.read_config()
     # In lockstep schema lines name the scenario: two runs of it are the same to the byte.
@@ -73,17 +72,22 @@ def gather(
     layout = partial(plan_table, tick_hz=tick_hz, labels=labels)
     scans: list[StreamScan] = []
     faults: list[str] = []
+    unread = set(without)
     for name, group in itertools.groupby(files, key=lambda file: file.table):
         together = list(group)
         table = _Table(run.tables / f"{name}.parquet", together, layout)
         for file in together:
-            scans.append(scan_stream(file, partial(table.add, file)))
+            try:
+                scans.append(scan_stream(file, partial(table.add, file)))
+            except MachineError as error:
+                unread.add(file.path)
+                faults.append(str(error).removeprefix(f"{run.path}/"))
             table.end_file(file)
             done.add(file)
         table.close()
         if table.fault:
             faults.append(f"tables/{name}.parquet: {table.fault}")
-    return Gathered(scans=tuple(scans), faults=tuple(faults), unread=frozenset(without))
+    return Gathered(scans=tuple(scans), faults=tuple(faults), unread=frozenset(unread))
 
 
 class _Done:

@@ -220,6 +220,9 @@ def _player(
         "limits": {each.name: list(each.limits) for each in channels if each.limits is not None},
         "queues": [each.name for each in channels if each.passing == "queue" and not each.is_frame],
     }
+    newest = [each.name for each in channels if each.passing == "newest" and each.is_frame]
+    if newest and recorded.config.time.is_lockstep:  # in real time no two are due at once
+        parameters["newest"] = newest
     if agent.ticks is not None:
         parameters |= {"ticks": str(agent.ticks), "phase_s": agent.phase_s}
     elif device is not None and device.kind == PLAYBACK:

@@ -35,6 +35,8 @@ class HeldTimes:
     def __init__(self, held: HeldBounds, source: RecordSource) -> None:
         self._changes: dict[str, list[tuple[Floats, Flags]]] = {}
         self._counts: dict[str, int] = {}
+        self._own: set[str] = set()
+        """Agents that recorded it themselves: what the host's half records of them under that name is not looked at."""
         self._names_agents = False
         """Whether the host's half says of whom its records are: none of them is of an agent that they do not name."""
         factor = (
@@ -69,6 +71,10 @@ class HeldTimes:
         if not len(states):
             return
         agent = owner_of(batch.agent)
+        if not batch.is_of_host:
+            self._own.add(agent)
+        elif agent in self._own:
+            return
         known = self._changes.setdefault(agent, [])
         before = known[-1][1][-1] if known else not states[0]
         changed = np.flatnonzero(np.diff(states, prepend=before))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Ge, Gt
 
@@ -47,7 +47,9 @@ class PlaybackParameters:
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """By channel, of one number or more: least and largest value, for these are not on record."""
     queues: tuple[str, ...] = ()
-    """Channels of which each value arrives once, in order; frames do in any case."""
+    """Channels of which each value arrives once, in order; frames do, but for those under `newest`."""
+    newest: tuple[str, ...] = ()
+    """Outputs of frames of which the newest alone goes out, where several are due at once, as in lockstep."""
 
 
 def channels_of(parameters: PlaybackParameters) -> tuple[Channel, ...]:
@@ -66,10 +68,16 @@ def channels_of(parameters: PlaybackParameters) -> tuple[Channel, ...]:
         replace(
             each,
             limits=parameters.limits.get(each.name),
-            passing="queue" if each.name in parameters.queues else each.passing,
+            passing=_passing(each, parameters),
         )
         for each in found
     )
+
+
+def _passing(channel: Channel, parameters: PlaybackParameters) -> Literal["newest", "queue"]:
+    if channel.name in parameters.newest and channel.direction == "out":
+        return "newest"
+    return "queue" if channel.name in parameters.queues else channel.passing
 
 
 def streams_of(directory: Path) -> list[tuple[Channel, Path]]:

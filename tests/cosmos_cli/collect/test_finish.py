@@ -3,6 +3,8 @@ import errno
 import os
 import shutil
 import tarfile
+import tempfile
+from pathlib import Path
 
 import orjson
 import pyarrow.parquet as pq
@@ -12,11 +14,14 @@ from harness import full_disk
 from harness.synthetic_run import SyntheticRun, make_config
 
 from cosmos_cli.collect import finish as finish_module
+from cosmos_cli.collect import previous_manifest
 from cosmos_cli.collect.finish import collect_run, finish_run
+from cosmos_cli.diff.recorded import recorded_streams
 from cosmos_cli.errors import InputError, RunFailedError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import Problem
 from madns_runtime.config import Deadline
+from madns_runtime.recording.reader import StreamReading
 from madns_runtime.recording.records import EVENTS, TICKS
 
 
@@ -50,6 +55,96 @@ def test_whole_run_is_green_and_leaves_all_its_evidence(tmp_path):
     assert made.run.report_html.exists()
     assert made.run.bundle.exists()
     assert not made.run.reserve.exists()
+
+
+@pytest.fixture
+def ordinary():
+    """A run of a user who is not root, whom modes of folders bind; the test acts for that user."""
+    folder = Path(tempfile.mkdtemp(prefix="cosmos-ordinary-"))
+    made = SyntheticRun(folder / "runs").write()
+    finish(made)
+    is_root = os.geteuid() == 0
+    if is_root:
+        for path in (folder, *folder.rglob("*")):
+            os.chown(path, 65534, 65534)
+        os.setegid(65534)
+        os.seteuid(65534)
+    yield made
+    if is_root:
+        os.seteuid(0)
+        os.setegid(0)
+    for path in made.run.path.rglob("*"):
+        path.chmod(0o700)
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("name", ["agents/agent-01", "tables"])
+def test_a_folder_of_which_the_names_alone_may_be_read_is_told(ordinary, name):
+    (ordinary.run.path / name).chmod(0o444)
+
+    summary = collect_run(ordinary.run, processes=lambda: [])
+
+    assert summary.exit_code == 5
+    assert f"{name}: not read: Permission denied" in summary.missing
+    assert recorded_streams(ordinary.run)
+
+
+@pytest.mark.parametrize("name", ["agents/agent-01/ticks.jsonl", "scenario.yaml"])
+def test_a_file_that_may_not_be_read_is_told_and_the_rest_is_judged(ordinary, name):
+    (ordinary.run.path / name).touch()
+    (ordinary.run.path / name).chmod(0)
+
+    summary = collect_run(ordinary.run, processes=lambda: [])
+
+    assert summary.exit_code == 5
+    assert f"{name}: not read: Permission denied" in summary.missing
+    assert summary.is_packed
+
+
+def test_a_stream_on_a_bad_disk_is_told_and_the_rest_is_judged_and_packaged(tmp_path, monkeypatch):
+    made = SyntheticRun(tmp_path).write()
+    finish(made)
+    bad = made.stream("agent-01", "ticks")
+    chunks = StreamReading.column_chunks
+
+    def breaking(self):
+        if self.path == bad:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return chunks(self)
+
+    monkeypatch.setattr(StreamReading, "column_chunks", breaking)
+
+    summary = collect_run(made.run, processes=lambda: [])
+
+    assert summary.exit_code == 5
+    assert "agents/agent-01/ticks.jsonl: cannot be read: Input/output error" in summary.missing
+    assert any(line.startswith("agent-01: ticks is missing") for line in summary.missing)
+    assert summary.document["records"]["written"] > 0
+    assert summary.is_packed
+
+
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [
+        (errno.EIO, "cannot be read: Input/output error"),
+        (errno.ENOENT, "missing; it was there when the run was collected"),
+    ],
+)
+def test_a_file_that_cannot_be_read_when_a_run_is_collected_again_is_told(
+    tmp_path, monkeypatch, number, told
+):
+    made = SyntheticRun(tmp_path).write()
+    (made.run.path / "notes.txt").write_text("seen")
+    finish(made)
+
+    def broken(path):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(previous_manifest, "file_entry", broken)
+
+    summary = collect_run(made.run, processes=lambda: [])
+
+    assert f"notes.txt: {told}" in summary.missing
 
 
 def test_run_json_holds_every_promised_key(tmp_path):

@@ -784,3 +784,21 @@ def test_records_about_names_that_are_no_agents_are_told_by_checks_that_leave_th
     )
     assert judge(of_all, tables={"host_slots": host}).remarks() == ()
     assert judge(*of_agents, tables=TABLES).remarks() == ()
+
+
+def test_of_a_condition_that_agents_and_the_host_record_an_agents_own_records_count():
+    fields = (Field("t_s", "s"), Field("x_m", "m"))
+    own = FakeTable("mode", fields, {"a": {"t_s": np.array([0.0]), "x_m": np.array([1.0])}})
+    columns = {"t_s": np.array([0.0, 50.0]), "x_m": np.array([-1.0, 1.0])}
+    columns["agent"] = objects(["a", "b"])
+    by_host = (*fields, Field("agent", "", "str"))
+    host = FakeTable("host_mode", by_host, {"host": columns}, role="host")
+    held = HeldBounds(stream="mode", field="x_m", bounds=ValueBounds.above(0.0))
+    counted = expect(statistic="count", bounds=ValueBounds.above(0.0), meanwhile=held)
+
+    results = [
+        judge(replace(counted, agents=(agent,)), tables={**TABLES, "mode": own, "host_mode": host})
+        for agent in ("a", "b")
+    ]
+
+    assert [each.results[0].got for each in results] == [len(T_S), len(T_S) / 2]

@@ -597,13 +597,14 @@ def test_parquet_file_of_somebody_else_is_no_table(tmp_path, about):
     assert open_tables(tmp_path) == {}
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_times_without_a_utc_are_null(tmp_path):
     labels = TableLabels.of(None, {"t0_utc": "2024-05-06T07:08:09Z"})
 
-    times = labels.utc_us(np.array([np.nan, np.inf, 1e300, 0.0000004, 0.0000006]))
+    times = labels.utc_us(np.array([np.nan, np.inf, 1e300, 1e308, 0.0000004, 0.0000006]))
 
     zero_us = 1714979289 * 10**6
-    assert times.tolist() == [NEVER_US, NEVER_US, NEVER_US, zero_us, zero_us + 1]
+    assert times.tolist() == [*[NEVER_US] * 4, zero_us, zero_us + 1]
 
 
 @pytest.mark.parametrize("said", [None, 3, "yesterday", "2024-05-06"])

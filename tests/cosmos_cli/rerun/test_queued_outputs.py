@@ -127,6 +127,26 @@ def test_a_queue_of_values_of_one_tick_is_the_same_again(tmp_path):
     assert done.returncode == 0
 
 
+@pytest.mark.process
+def test_frames_of_which_the_newest_of_a_tick_alone_goes_out_are_the_same_again(tmp_path):
+    of_bus = 'Channel(name="bus", direction="out", is_frame=True),'
+    (tmp_path / "pulser.py").write_text(DRIVER.replace("channels=(", f"channels=({of_bus}"))
+    twice = SIMULATION.replace('"pulse", 0.1', '"bus", b"a"').replace(
+        '"pulse", 0.2', '"bus", b"bc"'
+    )
+    (tmp_path / "pulses.py").write_text(twice)
+    (tmp_path / "pulses.yaml").write_text(SCENARIO)
+    cosmos = CosmosCommand(tmp_path)
+    code, document = cosmos.run(tmp_path / "pulses.yaml")
+    assert code == 0, document["verdict"]
+
+    done = cosmos("rerun", document["run"], "--json", "--quiet")
+    told = {each["name"]: each for each in json.loads(done.stdout)["devices"]}
+
+    bus = told["agent-01/pulser.bus"]
+    assert (bus["records"], bus["compared"], bus["different"]) == (9, 9, 0)
+
+
 def compared(tmp_path, recorded, rerun, *, events=(), schema=PULSE):
     """Return what the comparison of an output's values finds, (time in s, value) each, and *events* of the device on record."""
     for folder, rows in (("devices", recorded), ("rerun/devices", rerun)):
