@@ -223,7 +223,15 @@ def test_a_folder_or_a_binary_file_is_refused(tmp_path):
         ("a.json", JSON.replace("2017-", "1956-", 1), "2: EPOCH: expected such as"),
         ("a.json", JSON.replace("2017-", "2200-", 1), "2: EPOCH: expected such as"),
     ],
-    ids=["brackets", "digits", "wide head", "wide field", "last year", "before Sputnik", "beyond series"],
+    ids=[
+        "brackets",
+        "digits",
+        "wide head",
+        "wide field",
+        "last year",
+        "before Sputnik",
+        "beyond series",
+    ],
 )
 def test_what_no_element_set_looks_like_is_refused(tmp_path, name, text, fault):
     found = faults_of(tmp_path / name, text)
