@@ -127,6 +127,8 @@ def element_numbers(
     p = h * h / mu_m3_s2
     e_cos, e_sin = p / radius - 1.0, rv * h / (mu_m3_s2 * radius)
     e = math.hypot(e_cos, e_sin)
+    if e >= 1.0:  # by rounding: a line, or all but open
+        raise ValueError(f"expected a bound orbit, got e = {e!r}")
     sine = math.hypot(hx, hy)
     equatorial = sine < EQUATORIAL_SINE * h
     # Unit vectors to the node and, a quarter turn on, within the plane.
