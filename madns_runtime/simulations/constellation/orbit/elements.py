@@ -194,7 +194,8 @@ def solve_kepler(mean_anomaly_rad: float, eccentricity: float) -> float:
         if abs(following - anomaly) <= TOLERANCE_RAD * max(1.0, abs(anomaly)):
             return following
         anomaly = following
-    if high - low > 1e-12:
+    # At the perigee of a very long ellipse steps of the tolerance are lost in the rounding of the error.
+    if high - low > 1e-12 and abs(error) > TOLERANCE_RAD * abs(anomaly):
         raise ConvergenceError(f"M {mean_anomaly_rad!r} rad, e {eccentricity!r}: unsolved")
     return anomaly
 
