@@ -7,6 +7,7 @@ import pytest
 from constellation_fakes import FakeContext, Star, parameters
 
 from madns_runtime.config import from_mapping
+from madns_runtime.simulations.constellation.actions import SensorFault
 from madns_runtime.simulations.constellation.equipment import Sensors
 from madns_runtime.simulations.constellation.messages import Segment
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
@@ -141,6 +142,32 @@ def test_what_measurements_add_up_to_survives_those_that_never_come():
     assert felt[:, 0] == pytest.approx(0.5)
     gained_m_s = felt[:, 0] @ np.diff(times_s, prepend=0.0)
     assert gained_m_s == pytest.approx(0.5 * times_s[-1])
+
+
+def test_what_was_given_while_it_was_dead_is_in_its_next_measurement():
+    still, burn = np.zeros((3, 6)), Thrust(start_s=5.0, acceleration_m_s2=(0.5, 0.0, 0.0))
+    parts = ((0.0, 5.0, None), (5.0, 7.0, burn), (7.0, 12.0, None))
+    bench = Bench(
+        *(
+            segment(still, t0_s=start, knot_s=(end - start) / 2, thrust=thrust)
+            for start, end, thrust in parts
+        )
+    )
+    times_s, felt = [], []
+
+    for tick in range(101):
+        if tick == 40:
+            bench.suite.begin_failure(1, SensorFault(sensor="accelerometer", fault="dead"))
+        elif tick == 80:
+            bench.suite.end_failure(1)
+        state = bench.buffer.lookup(tick / HZ)
+        reading = bench.suite.step(tick, tick / HZ, state).get("accelerometer")
+        if reading is not None:
+            times_s.append(reading.t_s)
+            felt.append(reading.values[0])
+
+    assert bench.suite.summary()["accelerometer"] == {"samples": 60, "dropped": 40, "blind": 1}
+    assert np.array(felt) @ np.diff(times_s, prepend=0.0) == pytest.approx(0.5 * 2.0)
 
 
 # With its host -----------------------------------------------------------------------------------

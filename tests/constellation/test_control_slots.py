@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from control_harness import SCENARIOS, Fleet, flight_class
 
+from madns_runtime.simulations.constellation.flight.api import Reading
 from madns_runtime.simulations.constellation.flight.ring_consensus import RingMember, RingSettings
+from madns_runtime.simulations.constellation.messages import Delivery
 from madns_runtime.simulations.constellation.orbit.atmosphere import density_kg_m3, height_m
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.mean_elements import (
@@ -285,3 +287,22 @@ def test_faults_of_a_rings_settings_are_named():
     context = SimpleNamespace(settings=SLOTS | {"spacing_deg": 100}, index=0, agents=tuple("abcd"))
     with pytest.raises(ValueError, match="expected at most 90 for 4 agents, got 100"):
         RingMember(context, follows_sma=False)
+
+
+@pytest.mark.parametrize("wrong", [{"lam": None}, {"normal": [0.0, 1.0]}, {"a": math.nan}])
+def test_first_words_that_are_none_of_a_rings_are_left_alone(wrong):
+    said = []
+    context = SimpleNamespace(settings=SLOTS | {"slots": "kept"}, index=0, agents=("a", "b", "c"))
+    context.broadcast = context.send = lambda *message: said.append(message)
+    member = RingMember(context, follows_sma=False)
+    mean = mean_orbit(780.0, 0.0)
+    sine = math.sin(mean.i_rad)
+    normal = [sine * math.sin(0.3), -sine * math.cos(0.3), math.cos(mean.i_rad)]
+    hello = {"round": 0, "asks": False, "entries": b"", "t_s": 0.0, "a": mean.a_m, "normal": normal}
+
+    member.exchange(Reading(0.0, state(mean)))
+    member.hear(Delivery("b", 0.0, 0.1, hello | {"lam": 0.1}))
+    member.hear(Delivery("c", 0.0, 0.1, hello | {"lam": -0.1} | wrong))
+    member.exchange(Reading(300.0, state(mean)))
+
+    assert member.neighbours == ("b",)

@@ -136,3 +136,12 @@ def test_orbit_that_is_no_ellipse_is_refused():
         mean_from_state((7e6, 0.0, 0.0), (0.0, 8e3, 8e3), EGM_96)
     with pytest.raises(ValueError, match="node"):
         mean_from_state((7e6, 0.0, 0.0), (0.0, 7.5e3, 0.0), EGM_96)
+
+
+def test_who_has_all_but_stopped_has_no_mean_elements():
+    # Osculating an ellipse, of which J2's swing leaves none.
+    r_m = (-13859434.306529447, 23354063.171546113, 399018.1303012041)
+    v_m_s = (75.8011138923843, -92.33637790826799, -168.74614708607203)
+
+    with pytest.raises(ValueError, match="expected mean elements of an ellipse"):
+        mean_from_state(r_m, v_m_s, EGM_96)

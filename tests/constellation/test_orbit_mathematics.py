@@ -46,6 +46,24 @@ def test_what_is_no_ellipse_is_refused(e):
         solve_kepler(1.0, e)
 
 
+@pytest.mark.parametrize(
+    ("mean", "open_by"),
+    [
+        (1.1046391421946006e-10, 2.6309970259e-7),
+        (2.0621698581552357e-16, 1.5244e-12),
+        (1.3e-23, 4e-16),
+    ],
+)
+def test_keplers_equation_is_solved_at_the_perigee_of_the_longest_ellipses(mean, open_by):
+    e = 1.0 - open_by
+
+    eccentric = solve_kepler(mean, e)
+
+    # E - sin E by its series, as the difference of two nearly equal numbers would lose its digits.
+    solved = (1.0 - e) * eccentric + e * (eccentric**3 / 6.0 - eccentric**5 / 120.0)
+    assert solved == pytest.approx(mean, rel=1e-9, abs=4e-16 * eccentric)
+
+
 @given(eccentric=st.floats(-3.1, 3.1), e=st.floats(0.0, 0.95))
 def test_mean_anomaly_of_true_anomaly_is_keplers(eccentric, e):
     nu = true_from_eccentric(eccentric, e)

@@ -22,7 +22,11 @@ from madns_runtime.simulations.constellation.orbit.earth import (
     gmst_rad,
     gmst_rate_rad_s,
 )
-from madns_runtime.simulations.constellation.orbit.elements import Elements, state_from_elements
+from madns_runtime.simulations.constellation.orbit.elements import (
+    Elements,
+    elements_from_state,
+    state_from_elements,
+)
 from madns_runtime.simulations.constellation.orbit.visibility import (
     LIGHT_SPEED_M_S,
     coast,
@@ -194,3 +198,14 @@ def test_elevation_and_its_rate_are_those_of_a_turning_earth():
     slope = (sine(0.5)[0] - sine(-0.5)[0])[0, 0]
     assert sine(0.0)[0][0, 0] == pytest.approx(by_hand, abs=1e-14)
     assert sine(0.0)[1][0, 0] == pytest.approx(slope, rel=1e-5)
+
+
+def test_who_falls_in_a_line_but_for_the_last_digits_is_carried_on_by_the_series():
+    # Sideways some micrometres per second: its ellipse is a line to double precision.
+    falling = np.array([[4e8, 0.0, 0.0, -1000.0, 1e-6, 0.0]])
+
+    later = coast(falling, 20.0)
+
+    assert later[0, :3] == pytest.approx((4e8 - 20_000.0 - 0.5, 2e-5, 0.0), abs=1e-2)
+    with pytest.raises(ValueError, match="expected a bound orbit"):
+        elements_from_state((4e8, 0.0, 0.0), (-1000.0, 1e-6, 0.0), EGM_96.mu_m3_s2)

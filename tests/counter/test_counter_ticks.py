@@ -1,5 +1,6 @@
 """The counting benchmark on ticks of its own, as the thesis's: pure halves, a clock that moves when told."""
 
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -32,6 +33,7 @@ class World:
     def _context(self, parameters, send, name="host"):
         return SimpleNamespace(
             agents=AGENTS,
+            duration_s=20.0,
             parameters=parameters,
             agent_parameters=self.own,
             now_s=lambda: self.now,
@@ -49,7 +51,7 @@ class World:
         self.sent += 1
         self.host.receive(name, message)
 
-    def play(self, ticks, hz):
+    def play(self, ticks, hz, until_s=math.inf):
         """Tick agents, staggered over the period, and the host when it wants to."""
         due = self.host.timer(-0.5)
         events = [
@@ -63,9 +65,11 @@ class World:
                 due = self.host.timer(due)
             self.now = t_s
             self.agents[name].step(SimpleNamespace(index=k))
-        if due is not None:
+        if due is not None and due <= until_s:
             self.now = due
             self.host.timer(due)
+        if math.isfinite(until_s):
+            self.now = until_s
 
     def trips(self, stream):
         return [record[-1] for record in self.records if record[0] == stream]
@@ -115,6 +119,21 @@ def test_each_agent_is_answered_in_the_class_of_service_of_its_own_packets():
         assert set(world.services) == {("a", Service.BEST), ("b", Service.SYNC)}
 
 
+@pytest.mark.parametrize(("ticks", "unanswered"), [(9, 0), (13, 4)])
+def test_what_the_host_still_holds_at_the_end_is_not_lost(ticks, unanswered):
+    # The host's last tick before the end is at (2 - 1/4) / 2 s.
+    world = World(answer_hz=2.0)
+
+    world.play(ticks, 10.0, until_s=1.3)
+
+    for agent in world.agents.values():
+        summary = agent.finish()
+        assert summary["sent"] == ticks == summary["returned"] + summary["unanswered"]
+        assert (summary["lost"], summary["unanswered"]) == (0, unanswered)
+        assert all(check["passed"] for check in summary["checks"])
+    assert world.host.finish()["unanswered"] == unanswered * len(AGENTS)
+
+
 def test_host_that_was_held_up_counts_its_missed_ticks():
     world = World(answer_hz=10.0)
     world.host.timer(-0.5)
@@ -154,6 +173,7 @@ def test_overfull_waiting_rooms_are_counted(monkeypatch):
     for k in range(5):
         world.agents["a"].step(SimpleNamespace(index=k))
 
+    world.now = 0.75
     world.host.timer(0.75)
 
     assert world.host.finish()["refused"] == 2

@@ -7,6 +7,7 @@ from typing import Any
 
 from madns_runtime.plugin.api import HOST, AgentContext, AgentSimulation, DeviceView, Tick
 from madns_runtime.protocol.messages import Service
+from madns_runtime.simulations.counter.answer_times import last_answer_s
 from madns_runtime.simulations.counter.parameters import ROUND_TRIPS
 from madns_runtime.simulations.counter.round_trips import RoundTrips
 
@@ -115,7 +116,8 @@ class CounterAgent(AgentSimulation):
         ) in self._unread:  # it came back, but the tick at which it would be timed does not follow
             self._returned_count += self._in_flight.pop(packet, None) is not None
         self._unread = []
-        lost = self._sent_count - self._returned_count
+        unanswered = self._count_unanswered()
+        lost = self._sent_count - self._returned_count - unanswered
         summary: dict[str, Any] = {
             "service": self._service.name.lower(),
             "sent": self._sent_count,
@@ -129,8 +131,20 @@ class CounterAgent(AgentSimulation):
         }
         if self._reads_on_tick:
             summary["unread_refused"] = self._unread_refused_count
+        if self._context.parameters.answer_hz:
+            summary["unanswered"] = unanswered
         summary["checks"] = [
             {"name": f"counter.{name}", "limit": 0, "got": got, "passed": got == 0}
             for name, got in (("lost", lost), ("wrong_values", self._wrong_count))
         ]
         return summary
+
+    def _count_unanswered(self) -> int:
+        """Return how many packets the host holds for a tick that comes no more: those sent after its last one."""
+        context = self._context
+        answer_hz: float = context.parameters.answer_hz
+        if not answer_hz:
+            return 0
+        end_s = min(context.now_s(), context.duration_s)
+        last_s = last_answer_s(end_s, answer_hz, len(context.agents))
+        return sum(sent_s > last_s for sent_s, _ in self._in_flight.values())

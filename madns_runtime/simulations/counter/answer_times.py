@@ -1,9 +1,22 @@
-"""When the host answered, until an agent's packet shows that the answer arrived: its own round trips. Pure."""
+"""When the host answers, and until an agent's packet shows that the answer arrived: its own round trips. Pure."""
 
 from __future__ import annotations
 
+import math
+
 PENDING_MAX = 1024
 """Answers to one agent of which nothing is heard yet; the oldest beyond that counts as not seen."""
+
+
+def ahead_of(agents: int) -> float:
+    """Return by what share of its period the host's tick comes before the period's end: between two agents' ticks, not at one's."""
+    return 0.5 / agents
+
+
+def last_answer_s(end_s: float, answer_hz: float, agents: int) -> float:
+    """Return the simulated time of the host's last tick by *end_s*, s."""
+    ahead = ahead_of(agents)
+    return (math.floor(end_s * answer_hz + ahead) - ahead) / answer_hz
 
 
 class AnswerTimes:

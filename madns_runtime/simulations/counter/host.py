@@ -9,7 +9,7 @@ from typing import Any
 
 from madns_runtime.plugin.api import HostContext, HostSimulation
 from madns_runtime.protocol.messages import Service
-from madns_runtime.simulations.counter.answer_times import AnswerTimes
+from madns_runtime.simulations.counter.answer_times import AnswerTimes, ahead_of
 from madns_runtime.simulations.counter.parameters import ANSWER_ROUND_TRIPS, DEVICE_SAMPLES
 
 WAITING_MAX = 100_000
@@ -30,8 +30,7 @@ class CounterHost(HostSimulation):
         """Samples of a device that have come, by agent."""
         self._context = context
         self._answer_hz: float = context.parameters.answer_hz
-        # Half of an agent's share of the period before its end: between two agents' ticks, not at one's.
-        self._ahead = 0.5 / len(context.agents)
+        self._ahead = ahead_of(len(context.agents))
         self._ticks = 0
         self._missed_count = 0
         self._waiting: list[tuple[str, Any]] = []

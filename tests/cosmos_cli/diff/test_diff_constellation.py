@@ -44,8 +44,12 @@ MANEUVERS = StreamSchema(
         Field("agent", "", "str"),
         Field("number", "", "int"),
         Field("commanded_s", "s"),
+        Field("at_s", "s"),
         Field("executed_s", "s"),
         Field("dv_given_m_s", "m/s"),
+        Field("propagation_s", "s"),
+        Field("network_s", "s"),
+        Field("slack_s", "s"),
     ),
     shape="object",
 )
@@ -74,6 +78,7 @@ class Flown(SyntheticRun):
         turned_deg=None,
         rate_rad_s=0,
         apart_m=None,
+        begin_s=10.0,
     ):
         host = self.recorder("host", "host", MANEUVERS)
         for number, name in enumerate(self.names):
@@ -95,8 +100,10 @@ class Flown(SyntheticRun):
                 recorder.record("estimates", (tick, slot_error_deg))
             command = {"tick": 10, "number": 0, "kind": "delta_v", "x": 0.0, "y": delta_v_m_s}
             recorder.record("commands", command | {"z": 0.0})
-            given = {"agent": name, "number": 0, "commanded_s": 1.0, "executed_s": 10.0}
-            host.record("maneuvers", given | {"dv_given_m_s": delta_v_m_s * 0.9})
+            given = {"agent": name, "number": 0, "dv_given_m_s": delta_v_m_s * 0.9}
+            times = {"commanded_s": 1.0, "at_s": 10.0, "executed_s": 10.0}
+            slack = {"propagation_s": 0.25, "network_s": 0.5, "slack_s": begin_s - 1.0 - 1.25}
+            host.record("maneuvers", given | times | slack)
             recorder.close()
         host.close()
 
@@ -227,6 +234,16 @@ def test_different_epochs_are_said(fly, capsys):
     fly(), fly(epoch="2018-01-01T00:00:00Z")
 
     assert "epochs differ" in compared(capsys)["remarks"][0]
+
+
+@pytest.mark.parametrize(("begin_s", "given_m_s"), [(8.0, 0.9), (-179.0, 0.9), (-181.0, 0.0)])
+def test_a_burn_under_way_at_the_end_is_not_over(fly, capsys, begin_s, given_m_s):
+    # Centred on 10 s: of TICKS seconds the last burn has as many behind its time as before it.
+    fly(), fly(begin_s=begin_s)
+
+    control = compared(capsys)["control"]
+
+    assert [one["given_m_s"] for one in control["all"]] == [0.9, given_m_s]
 
 
 def test_terminal_tells_truth_measurements_control_and_estimates_apart(fly, capsys):

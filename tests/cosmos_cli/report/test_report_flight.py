@@ -29,6 +29,7 @@ MANEUVERS = StreamSchema(
         Field("dv_commanded_m_s", "m/s"),
         Field("dv_given_m_s", "m/s"),
         Field("slack_s", "s"),
+        *(Field(name, "s") for name in ("at_s", "propagation_s", "network_s")),
     ),
 )
 LINKS = StreamSchema(
@@ -59,7 +60,7 @@ CONTACTS = StreamSchema(
 ERROR_M, TICKS, TICK_HZ = 3.0, 100, 10.0
 
 
-def record(made):
+def record(made, *, slack_s=2.9):
     """Two maneuvers and four messages per agent; measurements are 3 m off and known a tick late."""
     host = made.recorder("host", "host", MANEUVERS, LINKS, CONTACTS)
     host.record("contacts", ("rise", "agent-01", "Kiruna", 1.0, None, None))
@@ -79,9 +80,9 @@ def record(made):
         for reason in ("no_radio", "too_long", "no_radio")[: 3 - number]:
             agent.record("refusals", (2, 0, reason))
         agent.close()
-        host.record("maneuvers", (1.0, name, "accepted", 4.0, 0.5, 0.49, 2.9))
-        host.record("maneuvers", (5.0, name, "postponed", 5.5, 0.25, 0.26, -0.01))
-        host.record("maneuvers", (8.0, name, "refused", None, 9.0, 0.0, None))
+        host.record("maneuvers", (1.0, name, "accepted", 4.0, 0.5, 0.49, slack_s, 4.0, 0.06, 0.02))
+        host.record("maneuvers", (5.0, name, "postponed", 5.5, 0.25, 0.26, -0.01, 5.4, 0.01, 0.2))
+        host.record("maneuvers", (8.0, name, "refused", None, 9.0, 0.0, None, 8.5, None, None))
         for t_s in (1.0, 2.0, 3.0):
             host.record("links", (t_s, name, "agent-01", "delivered", t_s + 0.01, 3e6))
         host.record("links", (4.0, name, "agent-01", "lost", None, 3e6))
@@ -143,6 +144,17 @@ def test_delta_v_that_a_stop_came_before_was_not_given(tmp_path):
     trace = control["Delta-v spent"].choices[0].marks[0]
     assert (trace.x.tolist(), trace.y.tolist()) == ([0.0, 4.0, 5.0], [0.0, 0.49, 0.49])
     assert [(one["commanded"], one["given, m/s"]) for one in rows] == [(3, 0.49)] * 2
+
+
+def test_delta_v_of_a_burn_under_way_at_the_end_is_not_counted(tmp_path):
+    made = SyntheticRun(tmp_path / "runs", make_config(2, ticks=TICKS, tick_hz=TICK_HZ))
+    made.write(with_states=True)
+    record(made, slack_s=1.4)  # from 2.5 s to 5.5 s
+    finish_run(made.run, made.result(duration_s=5.0), made.expected, has_report=False)
+
+    rows = cells(blocks_of(made)["Control"]["Maneuvers by agent"])
+
+    assert [(one["commanded"], one["given, m/s"]) for one in rows] == [(3, 0.0)] * 2
 
 
 def test_delta_v_that_a_failure_came_before_was_not_given(tmp_path):

@@ -25,6 +25,7 @@ from madns_runtime.simulations.constellation.analysis.attitudes import (
     AttitudeDifference,
     compare_attitudes,
 )
+from madns_runtime.simulations.constellation.analysis.burn_ends import EXECUTED, TIMES, ends_s
 from madns_runtime.simulations.constellation.analysis.loop_latency import loop_latencies
 from madns_runtime.simulations.constellation.analysis.measurement_errors import (
     MeasurementError,
@@ -58,7 +59,6 @@ ESTIMATES, COMMANDS, MANEUVERS = "estimates", "commands", "host_maneuvers"
 SLOT_ERROR = "slot_error_deg"
 SETTLED_SHARE = 0.1
 """The last part of a run, in which a controller has settled."""
-EXECUTED = "executed_s"
 GIVEN_FIELDS = ("delta_v_given_m_s", "dv_given_m_s", "given_m_s")
 
 
@@ -349,11 +349,11 @@ def _add_given(recorded: ComparedStream, given: dict[str, float], end_s: float) 
     name = next((n for n in GIVEN_FIELDS if n in recorded.names()), None)
     if name is None or "agent" not in recorded.names():
         return
-    times = [EXECUTED] if EXECUTED in recorded.names() else []
+    times = [each for each in TIMES if each in recorded.names()]
     for columns in recorded.batches(("agent", name, *times)):
         values = np.nan_to_num(as_array(columns[name]))
-        if times:
-            values[as_array(columns[EXECUTED]) > end_s] = 0.0
+        if EXECUTED in columns:
+            values[ends_s(columns) > end_s] = 0.0
         for agent, value in zip(columns["agent"].tolist(), values.tolist(), strict=True):
             given[str(agent)] = given.get(str(agent), 0.0) + value
 

@@ -23,6 +23,7 @@ from madns_runtime.analysis.values import (
     TableBlock,
     headings,
 )
+from madns_runtime.simulations.constellation.analysis.burn_ends import TIMES, ends_s
 from madns_runtime.simulations.constellation.analysis.slots import ControlRow
 
 MANEUVER_FIELDS = ("commanded_s", "agent", "status", "executed_s", "dv_commanded_m_s")
@@ -52,7 +53,8 @@ def maneuver_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
         return generic_blocks(table, run)
     if not table.rows:
         return [ReportRemark(text="No maneuver was commanded.")]
-    columns = table.read("host", (*MANEUVER_FIELDS, GIVEN, SLACK))
+    times = (name for name in TIMES if table.has(name))
+    columns = table.read("host", tuple(dict.fromkeys((*MANEUVER_FIELDS, GIVEN, SLACK, *times))))
     agents = columns["agent"].astype(str)
     status = columns["status"].astype(str)
     by_agent = {name: np.flatnonzero(agents == name) for name in sorted(set(agents.tolist()))}
@@ -61,9 +63,9 @@ def maneuver_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
         for name, values in columns.items()
         if name not in ("agent", "status")
     }
-    # What was to be given after the run had ended was not.
+    # What was to be given after the run had ended was not, and a burn under way then is not over.
     end_s = run.end_s
-    is_after = numbers["executed_s"] > end_s
+    is_after = ends_s(numbers) > end_s
     numbers[GIVEN] = np.where(is_after, 0.0, numbers[GIVEN])
     numbers["executed_s"] = np.where(is_after, np.nan, numbers["executed_s"])
     return [
@@ -117,7 +119,7 @@ def _delta_v(
     return grouped_lines(
         spent_by,
         title="Delta-v spent",
-        note="What the thrusters really gave, summed up over each vehicle's maneuvers.",
+        note="What the thrusters really gave, summed up over each vehicle's maneuvers that were over by the end.",
         y=Axis(unit="m/s"),
         form="steps",
     )

@@ -49,6 +49,8 @@ KEYS: Mapping[str, type] = {"round": int, "asks": bool, "entries": bytes}
 """Of a message between members, with their types."""
 HELLO_KEYS = frozenset(("t_s", "lam", "a", "normal"))
 """kept: what the first message, to everybody in view, has besides."""
+PLANE_NUMBERS = 3
+"""Of a plane's normal."""
 HIGHER_M = 100.0
 """Over which the rate's slope is taken."""
 FULL_TURN_DEG = 360.0
@@ -195,7 +197,7 @@ class RingMember:
             return
         if all(type(payload.get(key)) is kind for key, kind in KEYS.items()):
             self._heard[message.sender] = payload
-            if payload.keys() >= HELLO_KEYS:
+            if _is_hello(payload):
                 self._hellos[message.sender] = payload
 
     def exchange(self, reading: Reading) -> None:
@@ -349,6 +351,17 @@ def _number(settings: Mapping[str, Any], name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"flight.settings.{name}: expected a number, got {value!r:.80}")
     return float(value)
+
+
+def _is_hello(payload: Mapping[str, Any]) -> bool:
+    """Tell whether a message has all that a first one has: numbers, and a plane's normal of three."""
+    if not payload.keys() >= HELLO_KEYS:
+        return False
+    normal = payload["normal"]
+    if not isinstance(normal, list | tuple) or len(normal) != PLANE_NUMBERS:
+        return False
+    numbers = (payload["t_s"], payload["lam"], payload["a"], *normal)
+    return all(isinstance(one, float) and math.isfinite(one) for one in numbers)
 
 
 def _normal(mean: CircularElements) -> list[float]:

@@ -127,6 +127,8 @@ def element_numbers(
     p = h * h / mu_m3_s2
     e_cos, e_sin = p / radius - 1.0, rv * h / (mu_m3_s2 * radius)
     e = math.hypot(e_cos, e_sin)
+    if e >= 1.0:  # by rounding: a line, or all but open
+        raise ValueError(f"expected a bound orbit, got e = {e!r}")
     sine = math.hypot(hx, hy)
     equatorial = sine < EQUATORIAL_SINE * h
     # Unit vectors to the node and, a quarter turn on, within the plane.
@@ -192,7 +194,8 @@ def solve_kepler(mean_anomaly_rad: float, eccentricity: float) -> float:
         if abs(following - anomaly) <= TOLERANCE_RAD * max(1.0, abs(anomaly)):
             return following
         anomaly = following
-    if high - low > 1e-12:
+    # At the perigee of a very long ellipse steps of the tolerance are lost in the rounding of the error.
+    if high - low > 1e-12 and abs(error) > TOLERANCE_RAD * abs(anomaly):
         raise ConvergenceError(f"M {mean_anomaly_rad!r} rad, e {eccentricity!r}: unsolved")
     return anomaly
 

@@ -207,7 +207,10 @@ def _sma_of_energy(
     oblate = 0.5 * gravity.j2 * gravity.radius_m**2 / r2 * (3.0 * r_m[2] ** 2 / r2 - 1.0)
     kinetic = 0.5 * (v_m_s[0] ** 2 + v_m_s[1] ** 2 + v_m_s[2] ** 2)
     energy = kinetic - mu / radius * (1.0 - oblate)
-    cube = (1.0 - mean.ex**2 - mean.ey**2) ** -1.5
+    rest = 1.0 - mean.ex**2 - mean.ey**2
+    if rest <= 0.0:
+        raise ValueError(f"expected mean elements of an ellipse, got 1 - e^2 = {rest!r}")
+    cube = rest**-1.5
     return float(-0.5 * mu / energy * (1.0 + g * (3.0 * c * c - 1.0) * cube))
 
 

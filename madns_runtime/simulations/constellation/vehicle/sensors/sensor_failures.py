@@ -27,11 +27,16 @@ class SensorFailures:
         if all(each.fault != "stuck" for each in self._failures.values()):
             self._last = None
 
+    @property
+    def is_dead(self) -> bool:
+        """Whether no measurement comes."""
+        return any(each.fault == "dead" for each in self._failures.values())
+
     def altered(self, values: Measured) -> Measured | None:
         """Return what a measurement becomes; None if none comes. A stuck one repeats the first since it stuck."""
-        kinds = {each.fault for each in self._failures.values()}
-        if "dead" in kinds:
+        if self.is_dead:
             return None
+        kinds = {each.fault for each in self._failures.values()}
         for each in self._failures.values():
             if each.fault == "biased":
                 added = (*each.bias, *(0.0,) * (len(values) - len(each.bias)))
