@@ -247,11 +247,13 @@ class AgentRunner:
             self._port.mailbox.add(message)
         elif isinstance(message, FaultOrder):
             self._hardware.order_fault(message)
-        elif isinstance(message, ActionOrder):
-            self._actions.take(message)
         elif isinstance(message, AgentFault):
             self._faults.take(message)
-        elif self._takes_data:
+        elif not self._takes_data:
+            return  # its half is called no more
+        elif isinstance(message, ActionOrder):
+            self._actions.take(message)
+        else:
             self._call("refused" if type(message) is TransmissionRefusal else "receive", message)
 
     def _set_up(self, initial: Any) -> None:
@@ -392,6 +394,7 @@ class AgentRunner:
 
     def _fail(self, failure: HalfFailed) -> None:
         self._reactor.end_if_stray()  # by sys.exit, say: whoever forked it goes on
+        self._takes_data = False  # what came with it is too late
         self._port.flush()  # what the half sent leaves first: the word of its end would overtake it
         self._session.emergency(str(failure), monotonic())
         self._port.must_flush = True
