@@ -157,3 +157,49 @@ def test_an_agent_that_has_raised_is_called_for_nothing_more_that_came_with_it(
 
     assert result["agents"]["lost"] == ["agent-01"]
     assert (tmp_path / "calls.txt").read_text().split() == ["called", "abandon"]
+
+
+RAISING_HOST = """
+from dataclasses import dataclass
+from pathlib import Path
+from madns_runtime.plugin.api import HOST, AgentSimulation, HostSimulation, Simulation
+
+CALLS = Path(__file__).with_name("calls.txt")
+
+@dataclass(frozen=True)
+class Parameters:
+    pass
+
+class Host(HostSimulation):
+    def receive(self, agent, message):
+        with CALLS.open("a") as file:
+            file.write("called ")
+        raise ValueError("told to")
+
+class Agent(AgentSimulation):
+    def setup(self, context, initial):
+        self.context = context
+
+    def step(self, tick):
+        for number in range(3):
+            self.context.send(HOST, number)
+
+simulation = Simulation(name="raising", parameters=Parameters, host=":Host", agent=":Agent")
+"""
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_a_host_that_has_raised_is_called_for_nothing_more_that_came_with_it(tmp_path, mode):
+    (tmp_path / "raising.py").write_text(RAISING_HOST)
+    path = tmp_path / "raising.yaml"
+    scenario = {
+        "name": "raising",
+        "simulation": "./raising.py:simulation",
+        "agents": {"count": 1, "tick_hz": 10},
+        "time": {"mode": mode, "duration_s": 1},
+    }
+    path.write_text(yaml.safe_dump(scenario))
+    code, _ = CosmosCommand(tmp_path).run(path, *LOOSE)
+
+    assert code == 1
+    assert (tmp_path / "calls.txt").read_text().split() == ["called"]
