@@ -133,6 +133,8 @@ class AgentProcess:
             signal.alarm(ABANDON_S)
             self._runners[name].half.abandon()
             os.kill(os.getpid(), signal.SIGKILL)
+        # Already now: the last one that leaves the socket closes it.
+        self._process.awaited += after_s is not None
         self._dropped[name] = after_s
         # In the loop's next turn: the order came with messages that others of the process share.
         drop = partial(self._runners[name].emergency, reason)
@@ -179,7 +181,6 @@ class AgentProcess:
             if after_s is not None and not self._is_ending:
                 seat = next(seat for seat in self._seats if seat.name == name)
                 self._away.add(name)
-                self._process.awaited += 1
                 due_s = self._reactor.now_s() + max(after_s, RETURN_S_MIN)
                 self._reactor.call_at(due_s, partial(self._return, seat))
         self._stop_if_done()
