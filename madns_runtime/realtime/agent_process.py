@@ -175,6 +175,8 @@ class AgentProcess:
     def _ended(self, name: str, outcome: AgentOutcome) -> None:
         self._counted[name] = self._runners.pop(name).counted()
         self._outcomes[name] = outcome
+        if outcome.is_run_over:  # nobody returns to it any more
+            self._is_ending, self._process.awaited = True, 0
         if name in self._dropped:
             self._outcomes[name] = replace(outcome, as_ordered=True, may_restart=False)
             after_s = self._dropped.pop(name)

@@ -141,3 +141,19 @@ def test_the_last_agent_of_a_process_that_a_fault_ends_keeps_the_socket_for_its_
     assert (process._process.awaited, len(waiting)) == (1, 1)
     process._end("the run is over")
     assert process._process.awaited == 0
+
+
+def test_a_process_waits_for_nobody_who_was_to_return_to_a_run_that_is_over(monkeypatch):
+    stops = []
+    reactor = SimpleNamespace(now_s=lambda: 0.0, stop=lambda: stops.append(True))
+    monkeypatch.setattr(agent_process, "Reactor", lambda: reactor)
+    process = AgentProcess(None, [], None, life_fd=-1, tell_killed=lambda *told: None)
+    process._process = SimpleNamespace(awaited=1, close_if_unused=lambda: None)
+    process._away = {"a"}
+    process._runners = {"b": SimpleNamespace(counted=dict)}
+
+    process._ended("b", AgentOutcome(as_ordered=True, is_run_over=True))
+
+    assert (stops, process._process.awaited) == ([True], 0)
+    process._return(SimpleNamespace(name="a"))
+    assert process._runners == {}
