@@ -207,10 +207,19 @@ def why_no_rate(result: Mapping[str, Any], ticks_due: int | None) -> str:
         return "a single tick has no rate"
     agents, lost = mapping_at(result, "agents"), result.get("lost_on_purpose")
     on_purpose = frozenset(map(str, lost)) if isinstance(lost, list) else frozenset()
-    are_away = all(mapping_at(agents, name).get("state") == "lost" for name in agents)
-    if agents and are_away and on_purpose.issuperset(agents) and not result.get("lost"):
+    if not agents or not on_purpose.issuperset(agents) or result.get("lost"):
+        return ""
+    if all(mapping_at(agents, name).get("state") == "lost" for name in agents):
         return "all agents were away on purpose at the end"
+    if all(_ticks_run(mapping_at(agents, name)) < TICKS_OF_A_RATE for name in agents):
+        return "all agents were ended on purpose, and none was back for two ticks"
     return ""
+
+
+def _ticks_run(agent: Mapping[str, Any]) -> int:
+    """Return how many ticks an agent's last start has run, as it told at its end; 0 of one that told none."""
+    count = mapping_at(agent, "ticks").get("run")
+    return count if isinstance(count, int) else 0
 
 
 def run_status(facts: RunFacts) -> str:

@@ -137,9 +137,8 @@ class AgentRunner:
         self._takes_data = True
 
     def _make_ticks(self, seat: LoopSeat, recorder: Recorder) -> PacedTicks:
-        has_inputs = self._program.has_medium or self._has_devices
         calls = TickCalls(
-            prepare=self._prepare_tick if has_inputs else None,
+            prepare=self._prepare_tick if self._program.has_medium or self._has_devices else None,
             step=self.half.simulation.step,
             came_back=self._reactor.end_if_forked,
             failed=self._step_failed,
@@ -155,8 +154,7 @@ class AgentRunner:
         """Begin: says hello at once."""
         self._recorder.start()
         self._journal.event("start", pid=os.getpid())
-        warning = self._port.process.socket.warning
-        if warning:
+        if warning := self._port.process.socket.warning:
             self._journal.say("warning", warning)
         self._port.listen(self._take_datagram)
         self._pump()
@@ -229,7 +227,7 @@ class AgentRunner:
             case told.StartReceived(t0_host_s):
                 self._start_run(t0_host_s)
             case told.StopReceived():
-                self._outcome = AgentOutcome(as_ordered=True)
+                self._outcome = AgentOutcome(as_ordered=True, is_run_over=True)
                 self._close_records()
             case told.EmergencyOrdered(who, reason):
                 self._end_early(f"{who}: {reason}", is_own=who == self.name)
@@ -247,11 +245,13 @@ class AgentRunner:
             self._port.mailbox.add(message)
         elif isinstance(message, FaultOrder):
             self._hardware.order_fault(message)
-        elif isinstance(message, ActionOrder):
-            self._actions.take(message)
         elif isinstance(message, AgentFault):
             self._faults.take(message)
-        elif self._takes_data:
+        elif not self._takes_data:
+            return  # its half is called no more
+        elif isinstance(message, ActionOrder):
+            self._actions.take(message)
+        else:
             self._call("refused" if type(message) is TransmissionRefusal else "receive", message)
 
     def _set_up(self, initial: Any) -> None:
@@ -336,7 +336,9 @@ class AgentRunner:
 
     def _end_early(self, reason: str, *, is_own: bool) -> None:
         may_restart = is_own and not self._ticks.pacer.is_over  # no other start has a tick
-        self._outcome = AgentOutcome(as_ordered=False, reason=reason, may_restart=may_restart)
+        self._outcome = AgentOutcome(
+            as_ordered=False, reason=reason, may_restart=may_restart, is_run_over=not is_own
+        )
         self._takes_data = False
         self._cancel_timers()
         self._journal.event("emergency", reason=reason)
@@ -392,6 +394,7 @@ class AgentRunner:
 
     def _fail(self, failure: HalfFailed) -> None:
         self._reactor.end_if_stray()  # by sys.exit, say: whoever forked it goes on
+        self._takes_data = False  # what came with it is too late
         self._port.flush()  # what the half sent leaves first: the word of its end would overtake it
         self._session.emergency(str(failure), monotonic())
         self._port.must_flush = True

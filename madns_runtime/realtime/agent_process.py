@@ -133,6 +133,8 @@ class AgentProcess:
             signal.alarm(ABANDON_S)
             self._runners[name].half.abandon()
             os.kill(os.getpid(), signal.SIGKILL)
+        # Already now: the last one that leaves the socket closes it.
+        self._process.awaited += after_s is not None
         self._dropped[name] = after_s
         # In the loop's next turn: the order came with messages that others of the process share.
         drop = partial(self._runners[name].emergency, reason)
@@ -173,13 +175,14 @@ class AgentProcess:
     def _ended(self, name: str, outcome: AgentOutcome) -> None:
         self._counted[name] = self._runners.pop(name).counted()
         self._outcomes[name] = outcome
+        if outcome.is_run_over:  # nobody returns to it any more
+            self._is_ending, self._process.awaited = True, 0
         if name in self._dropped:
             self._outcomes[name] = replace(outcome, as_ordered=True, may_restart=False)
             after_s = self._dropped.pop(name)
             if after_s is not None and not self._is_ending:
                 seat = next(seat for seat in self._seats if seat.name == name)
                 self._away.add(name)
-                self._process.awaited += 1
                 due_s = self._reactor.now_s() + max(after_s, RETURN_S_MIN)
                 self._reactor.call_at(due_s, partial(self._return, seat))
         self._stop_if_done()

@@ -29,6 +29,8 @@ class AgentOutcome:
     reason: str = ""
     may_restart: bool = False
     """It failed by itself while the run may go on: another try makes sense."""
+    is_run_over: bool = False
+    """It was ended with the run: nobody is to return to that any more."""
 
 
 @dataclass(slots=True, kw_only=True)

@@ -138,7 +138,7 @@ class HostRuntime:
         )
         # Infinite is never: the timer is made once and moved.
         self._progress_timer = self._reactor.call_at(math.inf, self._progress)
-        self._is_set_up = self._awaits_jobs = False
+        self._is_set_up = self._awaits_jobs = self._has_failed = False
         self._takes_data = True
 
     def _open_line(self, fds: tuple[int, int], pending: bytes) -> OperatorLink:
@@ -392,9 +392,9 @@ class HostRuntime:
             self._call(name, *arguments)
 
     def _guard(self, call: Any, *arguments: Any) -> Any:
-        try:
-            return call(*arguments)
+        try:  # a half that has failed is called no more
+            return None if self._has_failed else call(*arguments)
         except HalfFailed as failure:
-            self._port.must_pump = True
+            self._port.must_pump = self._has_failed = True
             self._session.emergency(HOST, str(failure), monotonic())
             return None

@@ -96,7 +96,7 @@ class Supervisor:
         self._life_read_fd, self._life_write_fd = os.pipe()
         self._reason_read_fd, self._reason_write_fd = make_reason_pipe()
         self._children: dict[int, SupervisedProcess] = {}
-        self._is_ending = False
+        self._is_ending = self._is_run_over = False
         self._failed = False
         freeze_garbage()
         self._devices.start()
@@ -197,6 +197,7 @@ class Supervisor:
                 "as_ordered": outcome.as_ordered,
                 "reason": clean_text(outcome.reason)[: REASON_BYTES_MAX // 4],
                 "may_restart": outcome.may_restart,
+                "is_run_over": outcome.is_run_over,
             }
             os.write(self._reason_write_fd, orjson.dumps(told) + b"\n")
 
@@ -221,6 +222,9 @@ class Supervisor:
             if "killed" in told:
                 child.is_killed, child.returns_after_s = True, told["returns_after_s"]
                 continue
+            if told.get("is_run_over"):  # the host's word reaches nobody who is away
+                self._is_run_over = True
+                self._to_fork.clear()
             if told["as_ordered"]:
                 child.has_ended_well = True
                 continue
@@ -275,6 +279,8 @@ class Supervisor:
 
     def _may_restart(self, child: SupervisedProcess) -> bool:
         """Tell whether a process that failed is started again: by a fault's own word, or by the scenario's."""
+        if self._is_run_over:
+            return False
         if child.is_killed:
             return child.returns_after_s is not None
         return (
@@ -288,7 +294,7 @@ class Supervisor:
         self._reactor.call_at(self._reactor.now_s() + wait_s, partial(self._restart, child))
 
     def _restart(self, child: SupervisedProcess) -> None:
-        if self._is_ending:
+        if self._is_ending or self._is_run_over:
             self._reap()
         elif self._operator.is_cut:  # it comes back first, or all is over
             self._restart_in(RESTART_DELAY_S, child)

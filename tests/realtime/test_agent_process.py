@@ -34,7 +34,7 @@ def test_an_agent_that_returns_is_given_what_its_conditions_had_counted(monkeypa
     process = AgentProcess.__new__(AgentProcess)
     monkeypatch.setattr(agent_process, "Reactor", lambda: reactor)
     process.__init__(None, [seat], program, life_fd=-1, tell_killed=lambda *told: None)
-    process._process = SimpleNamespace(awaited=0)
+    process._process = SimpleNamespace(awaited=2)
     process._packs = {"a": None}
     process._runners = {"a": process._make_runner(seat)}
     for _ in range(2):
@@ -65,7 +65,7 @@ def test_an_agent_that_cannot_be_made_again_leaves_the_others_of_its_process_alo
     program = RoleProgram(make=object, parameters=None)
     monkeypatch.setattr(agent_process, "Reactor", lambda: reactor)
     process = AgentProcess(None, seats, program, life_fd=-1, tell_killed=lambda *told: None)
-    process._process = SimpleNamespace(awaited=0, close_if_unused=lambda: None)
+    process._process = SimpleNamespace(awaited=1, close_if_unused=lambda: None)
     process._packs = dict.fromkeys("ab")
     process._runners = {seat.name: process._make_runner(seat) for seat in seats}
 
@@ -112,3 +112,48 @@ def test_what_an_agent_learns_of_the_clock_is_followed_until_simulated_time_begi
     runner._handle(ClockEstimated())
 
     assert followed == told_devices == [t_s] * times
+
+
+def test_the_last_agent_of_a_process_that_a_fault_ends_keeps_the_socket_for_its_return(monkeypatch):
+    waiting, awaited_at_its_end = [], []
+    monkeypatch.setattr(
+        agent_process,
+        "Reactor",
+        lambda: SimpleNamespace(
+            now_s=lambda: 0.0, call_at=lambda due_s, call: waiting.append(call), stop=lambda: None
+        ),
+    )
+    seats = [SimpleNamespace(name=name) for name in "ab"]
+    process = AgentProcess(None, seats, None, life_fd=-1, tell_killed=lambda *told: None)
+    process._process = SimpleNamespace(awaited=0, close_if_unused=lambda: None)
+
+    def end(reason):
+        # As a runner does: it leaves the socket, which the last one closes, and tells that it has ended.
+        awaited_at_its_end.append(process._process.awaited)
+        process._ended("b", AgentOutcome(as_ordered=False, reason=reason))
+
+    process._runners = {"b": SimpleNamespace(emergency=end, counted=dict)}
+
+    process._killed("b", "restarted on purpose", 0.0)
+    waiting.pop()()
+
+    assert awaited_at_its_end == [1]
+    assert (process._process.awaited, len(waiting)) == (1, 1)
+    process._end("the run is over")
+    assert process._process.awaited == 0
+
+
+def test_a_process_waits_for_nobody_who_was_to_return_to_a_run_that_is_over(monkeypatch):
+    stops = []
+    reactor = SimpleNamespace(now_s=lambda: 0.0, stop=lambda: stops.append(True))
+    monkeypatch.setattr(agent_process, "Reactor", lambda: reactor)
+    process = AgentProcess(None, [], None, life_fd=-1, tell_killed=lambda *told: None)
+    process._process = SimpleNamespace(awaited=1, close_if_unused=lambda: None)
+    process._away = {"a"}
+    process._runners = {"b": SimpleNamespace(counted=dict)}
+
+    process._ended("b", AgentOutcome(as_ordered=True, is_run_over=True))
+
+    assert (stops, process._process.awaited) == ([True], 0)
+    process._return(SimpleNamespace(name="a"))
+    assert process._runners == {}

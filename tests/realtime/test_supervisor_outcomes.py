@@ -41,7 +41,7 @@ def test_ends_on_purpose_are_no_failures_after_which_an_agent_is_not_started_aga
     incarnation, killed_before, may
 ):
     supervisor = Supervisor.__new__(Supervisor)
-    supervisor._operator = SimpleNamespace(is_silent=False)
+    supervisor._operator, supervisor._is_run_over = SimpleNamespace(is_silent=False), False
     agents = Agents(count=1, restarts_max=1)
     config = SimpleNamespace(on_agent_loss="continue", agents=agents)
     supervisor._launch = SimpleNamespace(config=config)
@@ -52,12 +52,34 @@ def test_ends_on_purpose_are_no_failures_after_which_an_agent_is_not_started_aga
     assert supervisor._may_restart(child) is may
 
 
+def test_nobody_is_started_anew_once_one_tells_that_the_run_is_over():
+    stopped = []
+    supervisor = Supervisor.__new__(Supervisor)
+    supervisor._reason_read_fd, supervisor._reason_write_fd = make_reason_pipe()
+    supervisor._is_ending = supervisor._is_run_over = False
+    supervisor._devices = SimpleNamespace(reap=lambda: None)
+    supervisor._reactor = SimpleNamespace(stop=lambda: stopped.append(True))
+    away = SupervisedProcess(("agent-01",), 1, 1, AgentCalls(), is_killed=True, returns_after_s=9.0)
+    ended = SupervisedProcess(("agent-02",), os.getpid(), 1, AgentCalls())
+    supervisor._to_fork, supervisor._children = [away.agents], {os.getpid(): ended}
+
+    supervisor._write_outcomes({"agent-02": AgentOutcome(as_ordered=True, is_run_over=True)})
+    supervisor._read_outcomes()
+    supervisor._children.clear()
+    supervisor._restart(away)
+
+    assert (stopped, supervisor._children) == ([True], {})
+    assert not supervisor._may_restart(away)
+    for fd in (supervisor._reason_read_fd, supervisor._reason_write_fd):
+        os.close(fd)
+
+
 def test_a_process_that_cannot_be_started_anew_is_tried_again_and_costs_no_other(monkeypatch):
     said, due, forks = [], [], []
     supervisor = Supervisor.__new__(Supervisor)
     supervisor._operator = SimpleNamespace(is_cut=False, emit=said.append)
     supervisor._reactor = SimpleNamespace(now_s=lambda: 5.0, call_at=lambda *call: due.append(call))
-    supervisor._is_ending = False
+    supervisor._is_ending = supervisor._is_run_over = False
     child = SupervisedProcess(
         ("agent-01",), 1, 1, AgentCalls(), is_killed=True, returns_after_s=9.0
     )
@@ -93,7 +115,7 @@ def test_a_process_that_was_to_return_while_the_operator_was_cut_off_does_not_wa
     supervisor = Supervisor.__new__(Supervisor)
     supervisor._operator = SimpleNamespace(is_cut=True, emit=lambda event: None)
     supervisor._reactor = SimpleNamespace(now_s=lambda: 5.0, call_at=lambda *call: due.append(call))
-    supervisor._is_ending = False
+    supervisor._is_ending = supervisor._is_run_over = False
     child = SupervisedProcess(
         ("agent-01",), 1, 1, AgentCalls(), is_killed=True, returns_after_s=9.0
     )

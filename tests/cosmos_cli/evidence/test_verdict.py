@@ -331,13 +331,38 @@ def test_real_time_factor_of_a_single_tick_is_not_judged_and_that_is_said():
 def test_real_time_factor_of_agents_that_are_all_away_on_purpose_is_not_judged(
     states, on_purpose, lost, is_judged
 ):
-    agents = {name: {"state": state} for name, state in zip("ab", states, strict=False)}
+    agents = {
+        name: {"state": state, "ticks": {"run": 40}}
+        for name, state in zip("ab", states, strict=False)
+    }
     result = {"agents": agents, "lost_on_purpose": on_purpose, "lost": lost}
 
     verdict = judged(rtf=None, no_rate=why_no_rate(result, 40))
 
     assert ("time.rtf" in [check.name for check in verdict.checks]) is is_judged
     told = "time.rtf: not judged: all agents were away on purpose at the end"
+    assert (told in verdict.remarks) is not is_judged
+
+
+@pytest.mark.parametrize(
+    ("ticks", "on_purpose", "is_judged"),
+    [
+        ({"run": 1}, ["a", "b"], False),
+        (None, ["a", "b"], False),
+        ({"run": 2}, ["a", "b"], True),
+        ({"run": 1}, ["b"], True),
+    ],
+)
+def test_real_time_factor_of_agents_that_came_back_for_no_two_ticks_is_not_judged(
+    ticks, on_purpose, is_judged
+):
+    agents = {"a": {"state": "stopped", "ticks": ticks}, "b": {"state": "lost"}}
+    result = {"agents": agents, "lost_on_purpose": on_purpose, "lost": []}
+
+    verdict = judged(rtf=None, no_rate=why_no_rate(result, 40))
+
+    assert ("time.rtf" in [check.name for check in verdict.checks]) is is_judged
+    told = "time.rtf: not judged: all agents were ended on purpose, and none was back for two ticks"
     assert (told in verdict.remarks) is not is_judged
 
 
