@@ -18,8 +18,8 @@ from madns_runtime.config import AGENTS_MAX
 from madns_runtime.plain_values import mapping_at
 
 FIRST_DEFAULT: Final = 8
-TRIALS_MAX: Final = 64
-"""More than any search takes: 13 doublings to AGENTS_MAX, as many halvings, each twice at most."""
+NUMBERS_MAX: Final = 32
+"""More than any search takes: 13 doublings to AGENTS_MAX, and as many halvings."""
 RUN_LIMIT_S: Final = 600.0
 """For one trial beyond its simulated time: start, end, records and verdict of thousands of agents."""
 SCENARIO: Final = Path(__file__).parent / "data" / "capacity.yaml"
@@ -173,7 +173,7 @@ def find_capacity(
     )
     found = CapacityFound(search=search)
     failures = 0
-    for _ in range(TRIALS_MAX):
+    for _ in range(NUMBERS_MAX * trials.tries):
         agents = search.following()
         if agents is None:
             break

@@ -54,6 +54,10 @@ _WORDS: dict[str, bool | None] = {
 }
 _FLOW_MARKS = re.compile(r"""\$\{|["'\[\]{},:]""")
 """In a line of a flow mapping or list: what begins or ends a plain text, and a variable."""
+_SEPARATORS = "\x85\u2028\u2029"
+"""Ends of lines to the parser (YAML 1.1), and letters to YAML 1.2, to editors and to whoever counts lines."""
+_PRIVATE = (*range(0xE000, 0xF900), *range(0xF0000, 0xFFFFE))
+"""Characters without a meaning, which stand for them while the parser reads."""
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 _ESCAPE = (
@@ -196,7 +200,12 @@ class _Composer:
         self.source = source
         self.has_64_bits = has_64_bits
         self.anchors: dict[str, Node] = {}
-        self.events: Iterator[Any] = yaml.parse(source.text, Loader=_PARSER)
+        used = set(source.text)
+        free = (code for code in _PRIVATE if chr(code) not in used)
+        stand_ins = {ord(each): next(free, 0xFFFD) for each in _SEPARATORS if each in used}
+        self.restored = {code: each for each, code in stand_ins.items()}
+        text = source.text.translate(stand_ins) if stand_ins else source.text
+        self.events: Iterator[Any] = yaml.parse(text, Loader=_PARSER)
 
     def document(self) -> Node | None:
         next(self.events)  # the start of the stream
@@ -244,13 +253,13 @@ class _Composer:
             raise self.error(_tag_text(event.tag), event)
 
     def scalar(self, node: Node, event: Any) -> None:
-        node.text = event.value
+        node.text = event.value.translate(self.restored) if self.restored else event.value
         node.is_plain = event.style in (None, "")
         if event.tag in ("!", _TAG + "str") or (event.tag is None and not event.implicit[0]):
-            node.value = event.value
+            node.value = node.text
             return
         try:
-            node.value = resolve_scalar(event.value, has_64_bits=self.has_64_bits)
+            node.value = resolve_scalar(node.text, has_64_bits=self.has_64_bits)
         except ValueError as error:
             node.value, node.fault = None, str(error)
             return
@@ -263,7 +272,7 @@ class _Composer:
             raise self.error(_tag_text(event.tag), event)
 
     def error(self, text: str, event: Any) -> InputError:
-        mark = event.start_mark
+        mark, text = event.start_mark, text.translate(self.restored)
         return InputError(
             faults=[self.source.fault(text, line=mark.line + 1, column=mark.column + 1)]
         )
@@ -327,6 +336,8 @@ class _Dumper(yaml.SafeDumper):
     def represent_text(self, text: str) -> Any:
         """Return the node of a text, in quotes where it would be something else without them."""
         style = None if is_text_without_quotes(text) else "'"
+        if any(each in text for each in _SEPARATORS):
+            style = '"'  # which escapes them
         return self.represent_scalar(f"{_TAG}str", text, style=style)
 
 

@@ -110,10 +110,9 @@ def _compare(  # noqa: PLR0913 - both sides of one channel
         kept = [row for row in a if None not in row[len(HEAD) :]]
         seen = [row for row in kept if row[0] + row[2] * 1e-6 <= agent.last_wake_s + SAME_TIME_S]
         if agent.ticks is None:
-            kept, b = (
-                [row for row in rows if row[0] <= agent.last_s + SAME_TIME_S] for rows in (a, b)
+            seen, b = (
+                [row for row in rows if row[0] <= agent.last_s + SAME_TIME_S] for rows in (kept, b)
             )
-            seen = kept
         pairs: list[Pair] = _in_order(seen, b)
         is_same, left_out = _is_same_input, len(kept) - len(seen)
     else:

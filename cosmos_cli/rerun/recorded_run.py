@@ -21,6 +21,7 @@ from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.kinds.playback import streams_of
 from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.reader import read_stream
+from madns_runtime.timing.rate import count_ticks
 
 FAULTS_SHOWN_MAX: Final = 10
 TICK_FIELDS: Final = 4
@@ -158,7 +159,8 @@ def _read_agent(folder: Path, config: RunConfig, *, is_killed: bool) -> Recorded
         InputError: They are not there, or the agent was started anew.
     """
     if config.time.is_lockstep:
-        last_s = config.time.duration_s - 1.0 / config.agents.tick_hz
+        tick_hz = config.agents.tick_hz
+        last_s = (count_ticks(config.time.duration_s, tick_hz) - 1) / tick_hz
         return RecordedAgent(ticks=None, last_s=last_s, last_wake_s=last_s)
     name, ticks = folder.name, folder / "ticks.jsonl"
     if any(folder.glob("ticks.[0-9]*.jsonl")):

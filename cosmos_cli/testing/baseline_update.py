@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -13,6 +14,8 @@ from cosmos_cli.models.yaml_source import YamlSource
 from cosmos_cli.testing.figures import ComparedFigure, FigureValue
 from madns_runtime.partial_file import write_whole
 
+_LINE_START = re.compile(r"(?<=\n)|(?<=\r)(?!\n)")
+"""As lines are counted in places: `str.splitlines` knows further ends."""
 Edit = tuple[int, int, int, str]
 """Line from 0, column from 0, characters that go, and the text that comes."""
 
@@ -52,7 +55,7 @@ def update_baseline(baseline: Baseline, compared: Sequence[ComparedFigure]) -> i
 
 def edited(document: Document, values: Mapping[str, FigureValue]) -> str:
     """Return the text of a baseline with new expected values, its comments and its order as they are."""
-    lines = document.source.text.splitlines(keepends=True)
+    lines = _LINE_START.split(document.source.text)
     edits = [
         edit
         for name, value in values.items()

@@ -126,11 +126,42 @@ def register_channels(registers: Sequence[Register]) -> tuple[Channel, ...]:
             components=("x", "y", "z") if each.count == 3 else (),
             direction=each.direction,
             rate_hz_max=1.0 / each.period_s if each.period_s else None,
-            limits=None if each.low is None or each.high is None else (each.low, each.high),
+            limits=_limits_of(each),
             safe=each.safe,
         )
         for each in registers
     )
+
+
+def _limits_of(register: Register) -> tuple[float, float] | None:
+    """
+    Return the limits of a register's value; an output's are no wider than what its integers can hold.
+
+    Raises:
+        PluginError: They can hold none of an output's values.
+    """
+    low, high = register.low, register.high
+    given = None if low is None or high is None else (low, high)
+    if register.direction == "in" or register.type.startswith("f"):
+        return given
+    edges = (raw * register.scale + register.offset for raw in _raw_range(register))
+    least, most = sorted(edges)
+    if not math.isfinite(most - least):
+        return given
+    if given is None:
+        return least, most
+    if given[0] <= given[1] and not (given[0] <= most and least <= given[1]):
+        raise PluginError(
+            f"{register.name}: {register.type} holds {least:g} to {most:g}, none of {given[0]:g} to {given[1]:g}"
+        )
+    return max(given[0], least), min(given[1], most)
+
+
+def _raw_range(register: Register) -> tuple[int, int]:
+    """Return the least and the largest integer that a register holds."""
+    bits = 8 * _width(register.type) - register.shift
+    is_signed = register.type.startswith("i")
+    return -(1 << bits - 1) if is_signed else 0, (1 << bits - int(is_signed)) - 1
 
 
 class RegisterDevice(Device):

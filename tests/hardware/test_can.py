@@ -223,6 +223,32 @@ def test_python_cans_virtual_bus_wakes_its_reader():
         assert frames(other, 1) == [frame(LONG, b"")]
 
 
+def test_what_python_can_cannot_read_closes_the_bus_and_is_told(monkeypatch):
+    """As of a serial adapter that hands on half a frame: the listener ended without a word, and nothing came any more."""
+    pytest.importorskip("can")
+    shared = {"library": "python-can", "python_can_interface": "virtual", "interface": "bus-3"}
+    with opened("can", **shared) as device:
+
+        def recv(_):
+            raise ValueError("invalid literal for int() with base 16: '12X'")
+
+        monkeypatch.setattr(device._bus._bus, "recv", recv)
+        device._bus._listener.join(60.0)
+        with pytest.raises(MachineError, match="bus-3: cannot read what came: ValueError: invalid"):
+            device.read()
+
+
+def test_a_frame_of_can_fd_is_left_out():
+    can = pytest.importorskip("can")
+    shared = {"library": "python-can", "python_can_interface": "virtual", "interface": "bus-4"}
+    with opened("can", **shared) as device, can.Bus(interface="virtual", channel="bus-4") as other:
+        other.send(can.Message(arbitration_id=1, is_extended_id=False, is_fd=True, data=bytes(64)))
+        other.send(can.Message(arbitration_id=2, is_extended_id=False, data=b"x"))
+
+        assert frames(device, 1) == [frame(2, b"x")]
+        assert device.health()["frames_left_out"] == 1
+
+
 def test_a_bus_that_python_can_does_not_know_and_a_missing_python_can(monkeypatch):
     pytest.importorskip("can")
     with (

@@ -54,6 +54,17 @@ def test_scales_and_offsets_are_found_as_linux_names_them(converter):
         }
 
 
+@pytest.mark.parametrize("text", ["0.000000", "nan", "inf"])
+def test_a_scale_that_makes_no_value_is_refused_by_its_file(converter, text):
+    (converter / "out_voltage0_scale").write_text(text)
+    outputs = [{"name": "volts", "file": "out_voltage0_raw", "is_output": True}]
+    with (
+        pytest.raises(MachineError, match=f"out_voltage0_scale: .* other than 0, got {text}"),
+        opened("analog", root=str(converter.parent), inputs=outputs),
+    ):
+        pass
+
+
 def test_analog_outputs_are_written_raw_and_made_safe(converter):
     volts = {
         "name": "volts",

@@ -218,6 +218,8 @@ def test_a_period_keeps_a_register_from_being_read_each_time():
         ({"scale": 0.0}, "angle: expected a scale other than 0"),
         ({"address": 300}, "address"),
         ({"safe": 91.0}, "angle: safe value"),
+        ({"type": "u8", "safe": 26.0}, "angle: safe value 26.0 is beyond the limits"),
+        ({"type": "u8", "low": 30, "high": 90}, "angle: u8 holds 0 to 25.5, none of 30 to 90"),
         ({"type": "u8", "shift": 8}, "angle: shift: expected less than the 8 bits of u8, got 8"),
     ],
 )
@@ -225,6 +227,23 @@ def test_a_faulty_map_is_refused(change, told):
     shape = {"registers": [{**OUTPUT, **change}]}
     with pytest.raises((PluginError, ConfigurationError), match=told):
         prepare("i2c", {"address": 0x19, "map": shape}, None)
+
+
+@pytest.mark.parametrize(
+    ("change", "limits"),
+    [
+        ({"low": None, "high": None}, (-3276.8, 3276.7)),
+        ({"low": -90, "high": 1e4}, (-90, 3276.7)),
+        ({"scale": -0.5, "offset": 10, "type": "u8", "shift": 4}, (2.5, 10)),
+        ({"type": "f32_le"}, (-90, 90)),
+        ({"direction": "in", "safe": None, "low": None, "high": None}, None),
+    ],
+)
+def test_an_output_is_limited_to_what_its_register_holds(change, limits):
+    shape = {"registers": [{**OUTPUT, "safe": 3, **change}]}
+    (channel,) = prepare("i2c", {"address": 0x19, "map": shape}, None).channels
+
+    assert channel.limits == (limits and pytest.approx(limits))
 
 
 def test_spi_reads_and_writes_with_the_bits_of_the_chip():

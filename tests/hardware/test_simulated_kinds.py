@@ -62,6 +62,13 @@ def test_null_takes_anything_and_tells_the_time():
     assert [channel.limits for channel in program.channels] == [None, (-1.0, 1.0)]
 
 
+@pytest.mark.parametrize(("low", "high", "safe"), [(1.0, 5.0, 1.0), (-5.0, -2.0, -2.0)])
+def test_null_stands_in_for_an_output_that_is_never_zero(low, high, safe):
+    program = prepare("null", {"low": low, "high": high}, None)
+
+    assert [each.safe for each in program.channels if each.direction == "out"] == [safe]
+
+
 def record(folder, ages_s: Mapping[str, float]) -> list:
     """Record what a synthetic device gives, as its process does, and return (channel, t, age in us, values)."""
     program = prepare("synthetic", {"channels": CHANNELS, "seed": 3}, None)

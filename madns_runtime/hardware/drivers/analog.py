@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from madns_runtime.errors import PluginError
+from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.hardware.contract import Device, Sample, Value
 from madns_runtime.hardware.drivers.kernel_files import (
     ValueRefused,
@@ -27,7 +27,7 @@ class AnalogDevice(Device):
         Find scales and offsets.
 
         Raises:
-            MachineError: A file is missing, or says no number.
+            MachineError: A file is missing, or says no number, or no scale.
         """
         p = self.parameters
         self._folder = Path(p.root) / p.device
@@ -90,5 +90,18 @@ class AnalogDevice(Device):
         for name in (own, shared, re.sub(r"_[xyz]$", "", shared)):
             path = self._folder / f"{name}_{what}"
             if path.is_file():
-                return read_number(path)
+                return _scale(path) if what == "scale" else read_number(path)
         return default
+
+
+def _scale(path: Path) -> float:
+    """
+    Return the scale that a file says.
+
+    Raises:
+        MachineError: It says none that makes values.
+    """
+    scale = read_number(path)
+    if not scale or not math.isfinite(scale):
+        raise MachineError(f"{path}: expected a scale other than 0, got {read_text(path)}")
+    return scale

@@ -27,7 +27,7 @@ class CanBus(Protocol):
     frames_lost: int
     """Frames that came faster than they were read."""
     frames_left_out: int
-    """Requests and reports of errors."""
+    """Requests, reports of errors, and frames of CAN FD."""
 
     def fileno(self) -> int | None:
         """Return a descriptor that becomes readable when a frame has come; None if it has none."""

@@ -59,10 +59,10 @@ class PythonCanBus:
 
     def receive(self) -> tuple[int, bytes] | None:
         """
-        Return the next data frame; requests and reports of errors are left out.
+        Return the next data frame; requests, reports of errors and frames of CAN FD are left out.
 
         Raises:
-            MachineError: The bus is gone, or frames came faster than they were read.
+            MachineError: The bus is gone, gave what is no frame, or frames came faster than they were read.
         """
         while True:
             if not self._waiting:
@@ -73,7 +73,7 @@ class PythonCanBus:
             message = self._waiting.popleft()
             if isinstance(message, str):
                 raise MachineError(f"{self._where}: {message}")
-            if message.is_error_frame or message.is_remote_frame:
+            if message.is_error_frame or message.is_remote_frame or message.is_fd:
                 self.frames_left_out += 1
                 continue
             flag = EXTENDED if message.is_extended_id else 0
@@ -114,6 +114,8 @@ class PythonCanBus:
                 message = self._bus.recv(LISTEN_S)
             except (can.CanError, OSError) as error:
                 message = f"is gone: {error}"
+            except Exception as error:  # noqa: BLE001 - interfaces raise anything at a damaged frame
+                message = f"cannot read what came: {type(error).__name__}: {error}"
             if message is None:
                 continue
             if len(self._waiting) >= WAITING_MAX - 1:

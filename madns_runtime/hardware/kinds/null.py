@@ -18,14 +18,15 @@ class NullParameters:
     """Names of its outputs; each takes a number."""
     low: Annotated[float, Ge(-1e12), Le(1e12)] = -1e12
     high: Annotated[float, Ge(-1e12), Le(1e12)] = 1e12
-    """Limits of the outputs."""
+    """Limits of the outputs; safe is what is nearest to 0 within them."""
 
 
 def channels_of(parameters: NullParameters) -> tuple[Channel, ...]:
     """Return a clock, and the outputs that the parameters name."""
     limits = (parameters.low, parameters.high)
+    safe = min(max(0.0, parameters.low), parameters.high)
     outputs = tuple(
-        Channel(name=name, direction="out", limits=limits, safe=0.0) for name in parameters.outputs
+        Channel(name=name, direction="out", limits=limits, safe=safe) for name in parameters.outputs
     )
     return (Channel(name="time", unit="s"), *outputs)
 

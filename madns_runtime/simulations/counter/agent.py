@@ -70,7 +70,8 @@ class CounterAgent(AgentSimulation):
     def _send_samples(self, device: DeviceView) -> None:
         """Send [device, [[channel, number, time at which it was taken, value], ...]] of all that is new."""
         samples = []
-        for channel in device.inputs:
+        # By name: a device that is played back has its channels in that order.
+        for channel in sorted(device.inputs):
             reading = device[channel]
             if reading.number > self._numbers.get(channel, 0):
                 self._numbers[channel] = reading.number

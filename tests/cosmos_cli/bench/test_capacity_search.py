@@ -169,6 +169,13 @@ def test_number_counts_as_too_large_only_after_so_many_tries():
     assert found.search.held == 16
 
 
+def test_a_search_of_many_tries_comes_to_its_end():
+    found, _ = search(Runs(2600), tries=10, resolution=0.0)
+
+    assert (found.search.held, found.search.broken) == (2600, 2601)
+    assert found.stopped_by == ""
+
+
 def test_no_trial_begins_when_the_time_is_over():
     runs = Runs(99)
     found, _ = search(runs, end_s=0.0)

@@ -189,6 +189,25 @@ def test_empty_text_has_no_document():
     assert compose(YamlSource.of("a", "# nothing\n")) is None
 
 
+@pytest.mark.parametrize("separator", ["\x85", "\u2028", "\u2029"])
+def test_separators_of_yaml_1_1_end_no_line(separator):
+    text = (
+        f"a: 1  # one{separator}b: 2\nplain: x{separator}y\nquoted: 'x{separator} y'\nlast: .nan\n"
+    )
+    document = read_document(YamlSource.of("f", text))
+
+    assert list(document.value) == ["a", "plain", "quoted", "last"]
+    assert document.value["plain"] == f"x{separator}y"
+    assert document.value["quoted"] == f"x{separator} y"
+    assert [(each.line, each.source) for each in document.faults] == [(4, "last: .nan")]
+
+
+def test_separators_are_read_beside_what_stands_for_them():
+    text = "a: \ue000\u2028\ue001\x85\ue002\n"
+
+    assert read_document(YamlSource.of("f", text)).value == {"a": text[3:-1]}
+
+
 @given(st.text(max_size=200))
 def test_any_text_is_read_or_refused_with_a_place(text):
     try:
@@ -286,6 +305,12 @@ def test_what_is_written_is_read_as_the_same():
     }
 
     assert read_document(YamlSource.of("a.yaml", yaml_text(value))).value == value
+
+
+def test_separators_that_are_written_are_read_as_themselves():
+    value = {"a\u2028b": ["x\x85 y", "\u2029", "l\u2028\n  m"]}
+
+    assert read_document(YamlSource.of("f", yaml_text(value))).value == value
 
 
 @given(st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), max_size=12))

@@ -287,6 +287,14 @@ def test_a_value_that_cannot_be_replaced_leaves_the_file_as_it_is(baseline, figu
     assert found.path.read_text() == figures
 
 
+def test_letters_that_other_programs_take_for_line_ends_are_none(baseline):
+    found = baseline("# a\u2028b\x85c\r\nfigures:\n  a: {path: a, expected: 3.0}  # \u2029 x\n")
+    before = found.path.read_bytes()
+
+    assert update_baseline(found, [ComparedFigure(name="a", expected=3.0, got=12.5)]) == 1
+    assert found.path.read_bytes() == before.replace(b"3.0", b"12.5")
+
+
 def test_a_link_to_a_baseline_stays_a_link(baseline, tmp_path):
     baseline("figures: {a: {path: x, expected: 1}}")
     link = tmp_path / "link.yaml"
