@@ -4,7 +4,8 @@ Results of commands and refusals of messages in a rerun, each held until the tic
 In lockstep a result comes in the first tick that can know it. In real time the host's turn and the network may bring it
 a tick later; or a tick that woke up late hears of what was over after its nominal time: the host of a rerun tells what
 is over a tick ahead, see `LEAD_TICKS`. Flight software that is told in the recorded tick sees the same as then. A
-result's revision counts the changes of truth in the order in which the host heard of them, and is as on record, too.
+result's revision counts the changes of truth in the order in which the host heard of them, and is as on record, too; so is
+how late a command came, which its reason tells.
 Where today's commands are no longer those on record, from the first one that is given in another tick on, results are
 told as they would come.
 """
@@ -20,6 +21,7 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.recording.reader import read_stream
 from madns_runtime.simulations.constellation.messages import (
     LEAD_TICKS,
+    TOO_LATE,
     CommandResult,
     TransmissionRefusal,
 )
@@ -68,12 +70,12 @@ class RecordedResults:
         self.results: HeldNews[CommandResult] = HeldNews()
         self.refusals: HeldNews[TransmissionRefusal] = HeldNews()
         self._given = {row["number"]: row["tick"] for row in _rows(folder / "commands.jsonl")}
-        self._told: dict[tuple[int, bool], tuple[int, int, int]] = {}
-        """Tick, place among all results, and revision, by number and whether it is that of the execution."""
+        self._told: dict[tuple[int, bool], tuple[int, int, int, str]] = {}
+        """Tick, place among all results, revision and reason, by number and whether it is that of the execution."""
         self._refused: set[int] = set()
         for place, row in enumerate(_rows(folder / "command_results.jsonl")):
             number, status = row["number"], row["status"]
-            told = (row["tick"], place, row["revision"])
+            told = (row["tick"], place, row["revision"], row.get("reason") or "")
             self._told.setdefault((number, status == "executed"), told)
             if status == "refused":
                 self._refused.add(number)
@@ -108,8 +110,10 @@ class RecordedResults:
             self.results.hold(due, result)
             return
         # Without a record the run had ended before its agent heard of it.
-        tick, place, revision = self._told.get((number, is_executed), (NEVER, 0, result.revision))
-        self.results.hold((tick, place), replace(result, revision=revision))
+        untold = (NEVER, 0, result.revision, "")
+        tick, place, revision, reason = self._told.get((number, is_executed), untold)
+        again = replace(result, revision=revision, reason=_as_late(result.reason, reason))
+        self.results.hold((tick, place), again)
 
     def take_results(self, tick: int) -> list[CommandResult]:
         """Return the results of a tick."""
@@ -120,6 +124,14 @@ class RecordedResults:
         """Take a refusal that has come; one that is not on record is told at once."""
         key = (refusal.number, refusal.to, refusal.sent_s)
         self.refusals.hold(self._refusals.get(key, AT_ONCE), refusal)
+
+
+def _as_late(reason: str, recorded: str) -> str:
+    """Return a reason with the lateness on record, where both name one and say the same besides."""
+    late, _, others = reason.partition("; ")
+    late_then, _, others_then = recorded.partition("; ")
+    both_late = late.endswith(TOO_LATE) and late_then.endswith(TOO_LATE)
+    return recorded if both_late and others == others_then else reason
 
 
 def _rows(path: Path) -> Iterator[dict[str, Any]]:
