@@ -35,7 +35,7 @@ News = TypeVar("News")
 
 
 class _Told(NamedTuple):
-    """What is on record of a result."""
+    """Record of a result."""
 
     due: tuple[int, int]
     """Tick, and place among all results."""
