@@ -25,6 +25,8 @@ IDENTITY = ("agent", "satellite", "sender", "to", "receiver", "station", "kind",
 """Text fields that tell whom or what a record is about; records match only where they agree."""
 TIMES = ("t_s", "commanded_s", "sent_s", "rise_s", "at_s")
 """Fields of a time, in the order in which they are tried."""
+RANK = "number"
+"""Field of a record's own number: those of one time are pairs in its order, whenever each was recorded."""
 OWNERS = ("agent", "sender")
 """Of these the first is the agent that a record of the host belongs to."""
 By = Literal["tick", "time", "order"]
@@ -41,6 +43,8 @@ class Pairing:
     """Factors of the key, in the first and in the second run."""
     tolerance: float = TICK_TOLERANCE
     identity: tuple[str, ...] = ()
+    rank: str = ""
+    """Field that numbers the records of one time and whom, which a host may record in any order; empty for none."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -136,7 +140,9 @@ def choose_pairing(a: Sequence[Field], b: Sequence[Field], tick_hz: tuple[float,
             )
     time = next((name for name in TIMES if name in numbers), None)
     if time is not None:
-        return Pairing(by="time", column=time, tolerance=0.5 / max(tick_hz), identity=identity)
+        rank = RANK if RANK in numbers else ""
+        tolerance = 0.5 / max(tick_hz)
+        return Pairing(by="time", column=time, tolerance=tolerance, identity=identity, rank=rank)
     return Pairing(by="order", column="", identity=())
 
 
@@ -237,7 +243,9 @@ def _rows(
         count = len(columns[names[0]])
         keys = _keys(columns, pairing, counted, count) * scale
         counted += count
-        return Rows(keys=keys, who=_who(columns, pairing.identity, count), columns=dict(columns))
+        ranks = as_array(columns[pairing.rank]) if pairing.rank else None
+        who = _who(columns, pairing.identity, count)
+        return Rows(keys=keys, who=who, columns=dict(columns), ranks=ranks)
 
     batches = (rows_of(columns) for columns in recorded.batches(names))
     is_empty = True

@@ -32,6 +32,8 @@ class Rows:
     who: NDArray[Any]
     """Subject of each record, as text; records match only where it is the same. Shape (N,)."""
     columns: Columns
+    ranks: Floats | None = None
+    """Order of records of one key and whom, as their own numbers tell; None for the order of recording. Shape (N,)."""
 
     def __len__(self) -> int:
         """Return the number of records."""
@@ -40,7 +42,8 @@ class Rows:
     def take(self, index: NDArray[Any]) -> Rows:
         """Return the rows at *index*, numbers or a mask."""
         columns = {name: values[index] for name, values in self.columns.items()}
-        return Rows(keys=self.keys[index], who=self.who[index], columns=columns)
+        ranks = None if self.ranks is None else self.ranks[index]
+        return Rows(keys=self.keys[index], who=self.who[index], columns=columns, ranks=ranks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +61,7 @@ def match(a: Iterable[Rows], b: Iterable[Rows], *, tolerance: float) -> Iterator
     Match two streams whose keys grow.
 
     Records are pairs if each is the other's nearest and they are no further apart than *tolerance*.
-    Several records of one key and whom are matched in their order. A record that comes after others
+    Several records of one key and whom are matched in the order of their ranks, or else in their own. A record that comes after others
     with keys far beyond its own is not found by its partner, and both count as alone.
 
     Args:
@@ -82,9 +85,7 @@ def pair_up(a: Rows, b: Rows, tolerance: float) -> tuple[Indices, Indices]:
     if not is_key_a.any() or not is_key_b.any():
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     place_a, place_b = np.flatnonzero(is_key_a), np.flatnonzero(is_key_b)
-    line_a, line_b = _on_one_line(
-        (a.keys[place_a], a.who[place_a]), (b.keys[place_b], b.who[place_b]), tolerance
-    )
+    line_a, line_b = _on_one_line(a.take(place_a), b.take(place_b), tolerance)
     order_a, order_b = np.argsort(line_a, kind="stable"), np.argsort(line_b, kind="stable")
     sorted_a, sorted_b = line_a[order_a], line_b[order_b]
     partner = _nearest(sorted_a, sorted_b)
@@ -153,16 +154,14 @@ def _others(rows: Rows, paired: Indices, sure: float) -> tuple[NDArray[np.bool_]
     return is_left & is_over, is_left & ~is_over
 
 
-def _on_one_line(
-    a: tuple[Floats, NDArray[Any]], b: tuple[Floats, NDArray[Any]], tolerance: float
-) -> tuple[Floats, Floats]:
+def _on_one_line(a: Rows, b: Rows, tolerance: float) -> tuple[Floats, Floats]:
     """Return keys shifted so far apart for each whom and repetition that one search finds all pairs."""
-    count = len(a[0])
-    keys, who = np.concatenate((a[0], b[0])), np.concatenate((a[1], b[1]))
+    count = len(a)
+    keys, who = np.concatenate((a.keys, b.keys)), np.concatenate((a.who, b.who))
     code = np.zeros(len(keys), dtype=np.int64)
     if len(who) and (who != who[0]).any():
         code = np.unique(who.astype(str), return_inverse=True)[1].astype(np.int64)
-    repeated = np.concatenate((_repetition(a[0], code[:count]), _repetition(b[0], code[count:])))
+    repeated = np.concatenate((_repetition(a, code[:count]), _repetition(b, code[count:])))
     code = code * (int(repeated.max(initial=0)) + 1) + repeated
     low, apart = float(keys.min()), 4.0 * tolerance + 1.0
     length = (float(keys.max()) - low + apart) * (float(code.max()) + 1.0)
@@ -183,9 +182,10 @@ def _drawn_together(keys: Floats, gap_max: float) -> Floats:
     return together
 
 
-def _repetition(keys: Floats, code: Indices) -> Indices:
+def _repetition(rows: Rows, code: Indices) -> Indices:
     """Return for each row how many before it have its key and whom."""
-    order = np.lexsort((keys, code))
+    keys = rows.keys
+    order = np.lexsort((keys, code) if rows.ranks is None else (rows.ranks, keys, code))
     is_same = np.zeros(len(keys), dtype=np.bool_)
     is_same[1:] = (np.diff(keys[order]) == 0.0) & (np.diff(code[order]) == 0)
     place = np.arange(len(keys))
@@ -205,10 +205,12 @@ def _nearest(values: Floats, among: Floats) -> Indices:
 
 def _join(parts: Sequence[Rows]) -> Rows:
     names = parts[0].columns
+    ranks = [part.ranks for part in parts if part.ranks is not None]
     return Rows(
         keys=np.concatenate([part.keys for part in parts]),
         who=np.concatenate([part.who for part in parts]),
         columns={name: joined_column([p.columns[name] for p in parts]) for name in names},
+        ranks=np.concatenate(ranks) if len(ranks) == len(parts) else None,
     )
 
 

@@ -1,6 +1,7 @@
 """Results of commands and refusals of messages in a rerun: told in the ticks on record, and as they come where there is none."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -60,6 +61,42 @@ def test_a_revision_is_that_on_record_and_of_others_as_it_comes(recorded):
 
     found = {one.number: one.revision for one in recorded.take_results(8)}
     assert found == {0: 9, 3: 1}
+
+
+@pytest.mark.parametrize(
+    ("today", "told_again"),
+    [
+        ("0.04 s too late; y: 0.1 N m at most", "0.0423 s too late; y: 0.1 N m at most"),
+        ("y: 0.1 N m at most", "y: 0.1 N m at most"),
+        ("0.04 s too late; y: 0.2 N m at most", "0.04 s too late; y: 0.2 N m at most"),
+    ],
+)
+def test_how_late_a_command_came_is_that_on_record(today, told_again, tmp_path):
+    write(tmp_path, "commands", ("tick", "number"), [[2, 0]])
+    names = ("tick", "number", "status", "revision", "reason")
+    rows = [[5, 0, "postponed", 7, "0.0423 s too late; y: 0.1 N m at most"]]
+    write(tmp_path, "command_results", names, rows)
+    recorded = RecordedResults(tmp_path)
+    recorded.commanded(2, 1)
+
+    recorded.hold_result(replace(result(0, "postponed"), reason=today))
+
+    assert [one.reason for one in recorded.take_results(5)] == [told_again]
+
+
+def test_what_the_tank_held_when_a_command_was_over_is_that_on_record(tmp_path):
+    """The host of a rerun reads it a tick ahead, when a burn of the same time may not have been commanded yet."""
+    write(tmp_path, "commands", ("tick", "number"), [[2, 0]])
+    names = ("tick", "number", "status", "revision", "propellant_kg")
+    rows = [[3, 0, "accepted", 1, 4.5], [5, 0, "executed", 2, 4.0]]
+    write(tmp_path, "command_results", names, rows)
+    recorded = RecordedResults(tmp_path)
+    recorded.commanded(2, 1)
+
+    for status in ("accepted", "executed"):
+        recorded.hold_result(replace(result(0, status), propellant_kg=4.9))
+
+    assert [one.propellant_kg for one in recorded.take_results(5)] == [4.9, 4.0]
 
 
 def test_what_is_over_and_not_on_record_is_told_no_tick_ahead(recorded):

@@ -49,6 +49,8 @@ CommandKind = Literal["delta_v", "torque", "ballistic", "dipole"]
 CommandFrame = Literal["inertial", "rtn", "body"]
 LEAD_TICKS = 1
 """So much ahead of its time the host of a rerun tells that a command is over; the agent holds that back."""
+TOO_LATE = "s too late"
+"""Of a command that was not heard in time: ends the first part of its result's reason, how late it came."""
 CommandStatus = Literal["accepted", "executed", "postponed", "refused"]
 
 

@@ -32,9 +32,13 @@ UNLIKE: Final = (
     "flight_clock",
     "truth",
     "truth_changes",
-    *(f"maneuvers.{name}" for name in ("heard_s", "propagation_s", "network_s", "slack_s")),
+    *(
+        f"maneuvers.{name}"
+        for name in ("heard_s", "propagation_s", "network_s", "slack_s", "reason")
+    ),
 )
-"""Streams and fields that tell of computers' clocks and networks: how truth came in pieces, when the host heard."""
+"""Streams and fields that tell of computers' clocks and networks: how truth came in pieces, when the host heard, and by
+how much that was too late. What flight software was told of a command, reason and all, is judged in command_results."""
 
 
 def for_rerun(

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,20 @@ def test_records_about_others_are_never_pairs():
 
 def test_several_records_of_one_tick_are_paired_in_their_order():
     assert [i.tolist() for i in pair_up(rows([7, 7, 7]), rows([7, 7]), 0.25)] == [[0, 1], [0, 1]]
+
+
+def test_records_of_one_time_are_paired_by_their_numbers_in_whatever_order_they_were_recorded():
+    number, commanded = Field("number", "", "int"), Field("commanded_s", "s")
+    pairing = choose_pairing([commanded, AGENT, number], [commanded, AGENT, number], (10.0, 10.0))
+    early, late = rows([7, 7, 8, 7]), rows([7, 7, 7, 8])
+    a = replace(early, ranks=np.array([1.0, 3.0, 4.0, 2.0]))
+    b = replace(late, ranks=np.array([1.0, 2.0, 3.0, 4.0]))
+
+    [found] = match([a.take(np.array([0, 1])), a.take(np.array([2, 3]))], [b], tolerance=0.05)
+
+    assert pairing.rank == "number"
+    assert found.a.ranks.tolist() == found.b.ranks.tolist()
+    assert sorted(found.a.ranks.tolist()) == [1.0, 2.0, 3.0, 4.0]
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

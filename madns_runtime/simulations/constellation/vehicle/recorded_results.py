@@ -4,7 +4,9 @@ Results of commands and refusals of messages in a rerun, each held until the tic
 In lockstep a result comes in the first tick that can know it. In real time the host's turn and the network may bring it
 a tick later; or a tick that woke up late hears of what was over after its nominal time: the host of a rerun tells what
 is over a tick ahead, see `LEAD_TICKS`. Flight software that is told in the recorded tick sees the same as then. A
-result's revision counts the changes of truth in the order in which the host heard of them, and is as on record, too.
+result's revision counts the changes of truth in the order in which the host heard of them, and is as on record, too; so is
+how late a command came, which its reason tells, and what the tank held when it was over, which the host of a rerun reads
+before it has heard the commands of the tick between.
 Where today's commands are no longer those on record, from the first one that is given in another tick on, results are
 told as they would come.
 """
@@ -14,12 +16,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.recording.reader import read_stream
 from madns_runtime.simulations.constellation.messages import (
     LEAD_TICKS,
+    TOO_LATE,
     CommandResult,
     TransmissionRefusal,
 )
@@ -29,6 +32,26 @@ HELD_MAX: Final = 4096
 NEVER: Final = 1 << 62
 AT_ONCE: Final = (-1, 0)
 News = TypeVar("News")
+
+
+class _Told(NamedTuple):
+    """Record of a result."""
+
+    due: tuple[int, int]
+    """Tick, and place among all results."""
+    revision: int
+    propellant_kg: float | None
+    reason: str
+
+    def over(self, result: CommandResult) -> CommandResult:
+        """Return a result with what is its record's to tell."""
+        left_kg = self.propellant_kg if result.status == "executed" else None
+        return replace(
+            result,
+            revision=self.revision,
+            propellant_kg=result.propellant_kg if left_kg is None else left_kg,
+            reason=_as_late(result.reason, self.reason),
+        )
 
 
 class HeldNews(Generic[News]):
@@ -68,12 +91,13 @@ class RecordedResults:
         self.results: HeldNews[CommandResult] = HeldNews()
         self.refusals: HeldNews[TransmissionRefusal] = HeldNews()
         self._given = {row["number"]: row["tick"] for row in _rows(folder / "commands.jsonl")}
-        self._told: dict[tuple[int, bool], tuple[int, int, int]] = {}
-        """Tick, place among all results, and revision, by number and whether it is that of the execution."""
+        self._told: dict[tuple[int, bool], _Told] = {}
+        """By number and whether it is that of the execution."""
         self._refused: set[int] = set()
         for place, row in enumerate(_rows(folder / "command_results.jsonl")):
             number, status = row["number"], row["status"]
-            told = (row["tick"], place, row["revision"])
+            left_kg, reason = row.get("propellant_kg"), row.get("reason") or ""
+            told = _Told((row["tick"], place), row["revision"], left_kg, reason)
             self._told.setdefault((number, status == "executed"), told)
             if status == "refused":
                 self._refused.add(number)
@@ -108,8 +132,11 @@ class RecordedResults:
             self.results.hold(due, result)
             return
         # Without a record the run had ended before its agent heard of it.
-        tick, place, revision = self._told.get((number, is_executed), (NEVER, 0, result.revision))
-        self.results.hold((tick, place), replace(result, revision=revision))
+        told = self._told.get((number, is_executed))
+        if told is None:
+            self.results.hold((NEVER, 0), result)
+        else:
+            self.results.hold(told.due, told.over(result))
 
     def take_results(self, tick: int) -> list[CommandResult]:
         """Return the results of a tick."""
@@ -120,6 +147,14 @@ class RecordedResults:
         """Take a refusal that has come; one that is not on record is told at once."""
         key = (refusal.number, refusal.to, refusal.sent_s)
         self.refusals.hold(self._refusals.get(key, AT_ONCE), refusal)
+
+
+def _as_late(reason: str, recorded: str) -> str:
+    """Return a reason with the lateness on record, where both name one and say the same besides."""
+    late, _, others = reason.partition("; ")
+    late_then, _, others_then = recorded.partition("; ")
+    both_late = late.endswith(TOO_LATE) and late_then.endswith(TOO_LATE)
+    return recorded if both_late and others == others_then else reason
 
 
 def _rows(path: Path) -> Iterator[dict[str, Any]]:

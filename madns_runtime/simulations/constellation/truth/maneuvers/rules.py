@@ -13,7 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from madns_runtime.simulations.constellation.equipment import Vehicle
-from madns_runtime.simulations.constellation.messages import Command, CommandResult, CommandStatus
+from madns_runtime.simulations.constellation.messages import (
+    TOO_LATE,
+    Command,
+    CommandResult,
+    CommandStatus,
+)
 from madns_runtime.simulations.constellation.parameters import Maneuvers
 from madns_runtime.simulations.constellation.thrust import Vector
 from madns_runtime.simulations.constellation.truth.maneuvers.account import (
@@ -311,7 +316,7 @@ class ManeuverDesk:
         refused = replace(refused, begins_s=begins_s, is_late=is_late)
         reasons = given.limits if isinstance(given, WheelTurn | Magnetisation) else ()
         if is_late:
-            late = f"{ready_s - command.phase_s - start_s:.4g} s too late"
+            late = f"{ready_s - command.phase_s - start_s:.4g} {TOO_LATE}"
             if rules.settings.late == "refuse":
                 return replace(refused, reason=late)
             reasons = (late, *reasons)
