@@ -21,6 +21,7 @@ from cosmos_cli.ui.plural import counted
 from madns_runtime.analysis.sampling import as_array
 
 SCHEMA: Final = 1
+NOTHING_COMPARED: Final = "neither run has a record that is judged"
 STREAMS_SHOWN_MAX: Final = 20
 ROUNDING_RATIO: Final = 1e-8
 """Of a field's largest value: what half a microsecond moves within some ten seconds or more, such as a field or a position."""
@@ -158,7 +159,7 @@ class RerunOutcome:
             "rerun": self.streams.b.run.name,
             "directory": str(self.streams.b.run.path),
             "same": self.is_same,
-            "remarks": list(self.remarks),
+            "remarks": [*self.remarks, *([] if self.has_compared else [NOTHING_COMPARED])],
             "devices": [
                 {**asdict(each), "same": each.is_same, "judged": self.is_judged(each)}
                 for each in self.devices
@@ -209,7 +210,7 @@ def verdict_of(found: RerunOutcome) -> str:
     if found.is_same:
         return f"SAME: {both}"
     if not found.has_compared:
-        return "NOTHING COMPARED: neither run has a record that is judged"
+        return f"NOTHING COMPARED: {NOTHING_COMPARED}"
     names = [each.name for each in found.differing_channels]
     names += [one.table for one in found.differing] + found.alone
     names += [f"check {each.name}" for each in found.differing_expectations]

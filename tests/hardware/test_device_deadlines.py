@@ -17,14 +17,14 @@ from pathlib import Path
 
 import pytest
 import yaml
+from harness.cosmos_command import LOOSE, CosmosCommand
+from harness.machine_waits import MachineWaits
+from harness.waiting import wait_until
 
 from madns_runtime.config import AgentLaunch, Agents, DeviceLaunch, RunConfig
 from madns_runtime.hardware import guardian, manager, status
 from madns_runtime.processes import list_processes
 from tests.hardware.bench import AGENT, DeviceBench, still_running
-from tests.harness.cosmos_command import LOOSE, CosmosCommand
-from tests.harness.machine_waits import MachineWaits
-from tests.harness.waiting import wait_until
 
 pytestmark = pytest.mark.process
 

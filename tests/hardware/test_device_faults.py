@@ -12,12 +12,12 @@ from pathlib import Path
 import orjson
 import pytest
 import yaml
+from harness.cosmos_command import LOOSE, CosmosCommand
+from harness.machine_waits import MachineWaits
+from harness.waiting import wait_until
 
 from madns_runtime.config import DeviceLaunch
 from tests.hardware.bench import DRIVER, Terminal, line_bench, still_running
-from tests.harness.cosmos_command import LOOSE, CosmosCommand
-from tests.harness.machine_waits import MachineWaits
-from tests.harness.waiting import wait_until
 
 pytestmark = pytest.mark.process
 

@@ -8,6 +8,7 @@ import time
 
 import orjson
 import pytest
+from harness.waiting import is_alive, wait_until
 
 from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
@@ -15,7 +16,6 @@ from madns_runtime.hardware import guardian, manager, messages, page
 from madns_runtime.hardware.guardian import ATTEMPTS_MAX
 from tests.hardware import bench as bench_module
 from tests.hardware.bench import AGENT, DeviceBench, line_bench
-from tests.harness.waiting import is_alive, wait_until
 
 pytestmark = pytest.mark.process
 

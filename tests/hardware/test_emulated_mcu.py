@@ -12,14 +12,14 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from harness.firmware import build_firmware, needs_emulator
+from harness.waiting import is_alive, wait_until
 
 from madns_runtime.errors import ConfigurationError, MachineError, PluginError
 from madns_runtime.hardware.drivers.qmp import MachineMonitor
 from madns_runtime.hardware.kind_registry import prepare
 from madns_runtime.timing import granted_clock
 from tests.hardware.driving import opened
-from tests.harness.firmware import build_firmware, needs_emulator
-from tests.harness.waiting import is_alive, wait_until
 
 HERE = Path(__file__).parent
 pytestmark = [pytest.mark.process, needs_emulator]

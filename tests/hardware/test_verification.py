@@ -9,12 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from harness.firmware import build_firmware, needs_emulator
 
 from madns_runtime.hardware.kind_registry import registered_kinds
 from madns_runtime.hardware.verification.order import STEPS
 from tests.hardware.bench import is_late
 from tests.hardware.test_simulated_kinds import record
-from tests.harness.firmware import build_firmware, needs_emulator
 
 pytestmark = pytest.mark.process
 

@@ -1,17 +1,13 @@
 """The command line as its user has it: a process of its own, with its own folders of runs and of the register."""
 
-import atexit
-import functools
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-from harness.warm_commands import WarmCommands
+from harness.warm_commands import warm_commands
 
-FOUND = dict(os.environ)
-"""The environment before any test has changed it."""
 PATIENCE_S = 240.0
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 LOOSE = (
@@ -23,14 +19,6 @@ LOOSE = (
     "timeouts.shutdown_s=60",
 )
 """Settings with which a busy machine breaks no budget of time and loses no agent that waits for a processor."""
-
-
-@functools.cache
-def warm_commands():
-    """Return what this process forks its commands from."""
-    warm = WarmCommands({**FOUND, "NO_COLOR": "1"})
-    atexit.register(warm.close)
-    return warm
 
 
 class CosmosCommand:

@@ -7,7 +7,9 @@ of fleets start theirs from nothing, and so do those that change how Python itse
 """
 
 import array
+import atexit
 import contextlib
+import functools
 import gc
 import importlib
 import json
@@ -20,6 +22,8 @@ import subprocess
 import sys
 import time
 
+FOUND = dict(os.environ)
+"""The environment before any test has changed it."""
 STARTED_S = 60.0
 REQUEST_BYTES = 1 << 20
 READ_BYTES = 1 << 16
@@ -146,6 +150,14 @@ class WarmCommand:
             self.returncode = os.waitstatus_to_exitcode(int.from_bytes(told, "little"))
             self._told.close()
         return self.returncode
+
+
+@functools.cache
+def warm_commands():
+    """Return what this process forks its commands from."""
+    warm = WarmCommands({**FOUND, "NO_COLOR": "1"})
+    atexit.register(warm.close)
+    return warm
 
 
 def serve(channel):

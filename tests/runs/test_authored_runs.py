@@ -1,18 +1,20 @@
 """A scenario that extends another, from a root above it, with parameters of one agent's own: flown, kept, flown again."""
 
-import pytest
+import json
 
-from tests.harness.cosmos_command import LOOSE, CosmosCommand
+import pytest
+from harness.cosmos_command import LOOSE, CosmosCommand
 
 PLUGIN = """
 from dataclasses import dataclass
 from pathlib import Path
-from madns_runtime.plugin.api import AgentSimulation, HostSimulation, Simulation
+from madns_runtime.plugin.api import AgentSimulation, Field, HostSimulation, Simulation
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
     gain: float = 1.0
     table: str = "data/table.txt"
+    is_recorded: bool = True
 
 class Host(HostSimulation):
     def setup(self, context):
@@ -26,6 +28,13 @@ class Agent(AgentSimulation):
     def setup(self, context, initial):
         self.gain = context.parameters.gain
         self.table = (context.base_directory / context.parameters.table).read_text().strip()
+        self.context = context
+        if context.parameters.is_recorded:
+            context.open_stream("heights", [Field("t_s", "s"), Field("height_m", "m")])
+
+    def step(self, tick):
+        if self.context.parameters.is_recorded:
+            self.context.record("heights", [tick.t_s, self.gain * tick.t_s])
 
     def finish(self):
         return {"gain": self.gain, "table": self.table}
@@ -99,6 +108,17 @@ def test_such_a_run_is_flown_again_as_it_was(cosmos, run):
     done = cosmos("rerun", run["run"], "--as-recorded", "--json", "--quiet")
 
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.process
+def test_a_run_without_records_is_not_told_as_the_same(cosmos):
+    code, run = cosmos.run(cosmos.folder / "tree/few/few.yaml", "parameters.is_recorded=false")
+    assert code == 0
+
+    done = cosmos("rerun", run["run"], "--json", "--quiet")
+
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert json.loads(done.stdout)["remarks"] == ["neither run has a record that is judged"]
 
 
 @pytest.mark.process
