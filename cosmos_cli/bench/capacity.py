@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from cosmos_cli.bench.child_run import ChildRunOutcome, run_child
 from cosmos_cli.bench.search import CapacitySearch
-from cosmos_cli.errors import ExitCode
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.system.bounded_process import path_word
 from cosmos_cli.ui.console import Column
 from cosmos_cli.ui.plural import counted
@@ -166,7 +166,7 @@ def find_capacity(
         run: As `run_child`.
 
     Raises:
-        InputError: An option does not fit.
+        InputError: An option does not fit, or the scenario refuses the first trial.
     """
     search = CapacitySearch(
         first=trials.first, largest=trials.largest, resolution=trials.resolution
@@ -184,11 +184,17 @@ def find_capacity(
             f"trial {len(found.trials) + 1}: {counted(agents, 'agent')} at {trials.hz:g} Hz for {trials.seconds:g} s"
         )
         settings = [word for each in trials.overrides(agents) for word in ("--set", each)]
-        outcome = run(
-            [path_word(scenario), "--no-report", *options, *settings],
-            limit_s=trials.seconds + RUN_LIMIT_S,
-            is_quiet=True,
-        )
+        try:
+            outcome = run(
+                [path_word(scenario), "--no-report", *options, *settings],
+                limit_s=trials.seconds + RUN_LIMIT_S,
+                is_quiet=True,
+            )
+        except InputError as error:  # it takes no such number: what is known by now stays
+            if not found.trials:
+                raise
+            found.stopped_by = f"with {counted(agents, 'agent')} {error}"
+            break
         if not _take_end(found, outcome, trials):
             break
         trial = CapacityTrial(

@@ -12,7 +12,7 @@ from cosmos_cli.bench.capacity import SCENARIO, CapacityFound, CapacityTrials, f
 from cosmos_cli.bench.child_run import ChildRunOutcome
 from cosmos_cli.bench.prediction import predict
 from cosmos_cli.bench.search import CapacitySearch
-from cosmos_cli.errors import ExitCode
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.loading import load_scenario
 
@@ -91,8 +91,10 @@ class Runs:
         assert (scenario.agents.tick_hz, scenario.agents.per_process) == (100.0, min(3, count))
         assert scenario.deadline.max_miss_ratio == 1e-3
         number = f"n{len(self.agents)}"
-        if number in self.special:
-            return self.special[number]
+        if isinstance(special := self.special.get(number), Exception):
+            raise special
+        if special is not None:
+            return special
         holds = count <= self.capacity
         document = {"run": f"00-{count}", "verdict": "PASSED" if holds else "too many missed"}
         return ChildRunOutcome(exit_code=0 if holds else 4, document=document)
@@ -144,6 +146,30 @@ def test_interruption_and_lost_machines_end_the_search(special, exit_code, stopp
     assert (found.exit_code, found.stopped_by) == (exit_code, stopped_by)
     assert [trial.agents for trial in found.trials] == [8, 16]
     assert found.words == "at least 16 agents keep it"
+
+
+def test_a_number_that_the_scenario_refuses_ends_the_search_with_what_it_has_found():
+    refused = InputError("s.yaml:3: agents.count: 10 satellites for 16 agents")
+
+    found, _ = search(Runs(99, n2=refused))
+
+    assert found.words == "at least 8 agents keep it"
+    assert found.exit_code == ExitCode.OK
+    assert found.stopped_by == f"with 16 agents {refused}"
+
+
+def test_a_scenario_that_refuses_its_first_trial_is_bad_input():
+    with pytest.raises(InputError):
+        search(Runs(99, n1=InputError("s.yaml:3: no")))
+
+
+def test_a_refusal_before_any_number_held_is_not_green():
+    found, _ = search(Runs(0, n2=InputError("at least 8 agents")))
+
+    assert (found.exit_code, found.words) == (
+        ExitCode.BUDGET_BROKEN,
+        "8 agents break it, and no smaller number kept it",
+    )
 
 
 @pytest.mark.parametrize(
