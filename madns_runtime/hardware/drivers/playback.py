@@ -6,6 +6,7 @@ import heapq
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -114,13 +115,19 @@ def _samples(
         )
 
 
+def _meant(tick_hz: float, t_s: float) -> float:
+    """Return a time, s, or that of the tick beside which it lies by rounding alone."""
+    tick_s = round(t_s * tick_hz) / tick_hz
+    return tick_s if abs(t_s - tick_s) <= ROUNDING_S else t_s
+
+
 def _finder(parameters: PlaybackParameters) -> Callable[[float], float]:
     """Return what tells when in simulated time a sample is there that was handed on at a time, s."""
     tick_hz, start_s = parameters.tick_hz, parameters.start_s
     if tick_hz is None:
         return float
     if parameters.ticks is None:
-        return lambda handed_s: math.ceil((handed_s - ROUNDING_S) * tick_hz) / tick_hz
+        return partial(_meant, tick_hz)
     nominal_s: list[float] = []
     woke_s: list[float] = []
     for tick, lateness_us, *_ in read_stream(parameters.ticks).records():
