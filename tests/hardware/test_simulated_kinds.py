@@ -273,6 +273,21 @@ def test_a_playback_of_lockstep_gives_a_sample_between_two_ticks_when_it_was_han
         assert device.next_s() == 2 / 3
 
 
+def test_a_sample_of_a_tick_of_lockstep_does_not_lie_behind_that_tick_as_its_time_was_rounded(
+    tmp_path,
+):
+    record(tmp_path, {"gyro": 0.0, "level": 0.0})
+    (tmp_path / "thirds").mkdir()
+    schema = (tmp_path / "level.jsonl").read_text().splitlines()[0]
+    samples = f"{schema}\n[0.333333,1,0,1.5]\n[0.666667,2,0,1.5]\n[0.8,3,0,1.5]\n"
+    (tmp_path / "thirds" / "level.jsonl").write_text(samples)
+
+    with opened("playback", tmp_path, directory="thirds", tick_hz=3.0) as device:
+        taken_s = [device.sample_at(1.0).taken_s for _ in range(3)]
+
+    assert taken_s == [1 / 3, 2 / 3, 0.8]
+
+
 def test_recorded_outputs_take_what_they_are_given_and_limits_are_told(tmp_path):
     fields = [("t_s", "s"), ("lateness_us", "us"), ("duty", "1")]
     told = ",".join(f'{{"name":"{name}","unit":"{unit}","kind":"float"}}' for name, unit in fields)

@@ -24,13 +24,12 @@ class PlaybackDevice(SimulatedDevice):
 
     def open(self) -> str:
         """Begin the recording."""
-        start_s, has_ticks = self.parameters.start_s, self.parameters.tick_hz is not None
         found_at = _finder(self.parameters)
         channels = streams_of(self.parameters.directory)
         self._has_inputs = any(channel.direction == "in" for channel, _ in channels)
         self._samples: Iterator[tuple[float, Sample]] = heapq.merge(
             *(
-                self._samples_of(channel, path, start_s, found_at, has_ticks=has_ticks)
+                self._samples_of(channel, path, found_at)
                 for channel, path in channels
                 if channel.direction == "in"
             ),
@@ -44,17 +43,11 @@ class PlaybackDevice(SimulatedDevice):
         self._samples, self._next = iter(()), None
 
     def _samples_of(
-        self,
-        channel: Channel,
-        path: Path,
-        start_s: float,
-        found_at: Callable[[float], float],
-        *,
-        has_ticks: bool,
+        self, channel: Channel, path: Path, found_at: Callable[[float], float]
     ) -> Iterator[tuple[float, Sample]]:
         """Yield the samples of one input with their times, and count the lines of its file that were none."""
         stream = read_stream(path)
-        yield from _samples(channel, stream, start_s, found_at, has_ticks=has_ticks)
+        yield from _samples(channel, stream, self.parameters, found_at)
         self.count("damaged_lines", stream.state.damaged + stream.state.truncated_lines)
 
     def sample_at(self, t_s: float) -> Sample | None:
@@ -80,10 +73,8 @@ class PlaybackDevice(SimulatedDevice):
 def _samples(
     channel: Channel,
     stream: StreamReading,
-    start_s: float,
+    parameters: PlaybackParameters,
     found_at: Callable[[float], float],
-    *,
-    has_ticks: bool,
 ) -> Iterator[tuple[float, Sample]]:
     """
     Yield the samples of one input with the simulated time at which each is handed on, s.
@@ -91,10 +82,14 @@ def _samples(
     Raises:
         PluginError: A record is no sample's.
     """
+    has_ticks = parameters.tick_hz is not None
+    is_lockstep = has_ticks and parameters.ticks is None
     for record in stream.records():
         t_s, _, age_us, *values = record
         try:
-            taken_s = t_s - start_s
+            taken_s = t_s - parameters.start_s
+            if is_lockstep:  # one of a tick itself must not lie behind that tick
+                taken_s = found_at(taken_s)
             handed_s = taken_s + age_us * 1e-6
             value: Any = values if channel.shape else values[0]
             if channel.is_frame:
