@@ -8,7 +8,7 @@ played back, and a run in real time that ended early ends again with the tick th
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -25,6 +25,7 @@ ATTEMPTS_MAX: Final = 20
 """At leaving out what is refused: a check may come after one that was left out."""
 TIMES: Final = ("at_s", "every_s", "rate_per_h", "from_s", "to_s", "for_s")
 IN_SAMPLES: Final = "is in the samples on record, and not inserted again"
+ALTERS_NOTHING: Final[Mapping[str, Any]] = {"fault": "drop", "value": 0}
 STANDS_FOR: Final = "on record:"
 _PLACE: Final = re.compile(r"(timeline|checks)\[(\d+)\]")
 Item = dict[str, Any]
@@ -95,7 +96,7 @@ def carried_over(recorded: FlownRun) -> CarriedOver:
     substitute_variables(document)
     found.timeline = _items(document.value, "timeline")
     found.checks = _items(document.value, "checks")
-    _replace(found, DEVICE_FAULT.word, lambda word: f"{word} {IN_SAMPLES}")
+    _replace_device_faults(found, is_lockstep=recorded.config.time.is_lockstep)
     if not recorded.config.time.is_lockstep:
         _end_as_recorded(found, recorded)
     return found
@@ -116,12 +117,25 @@ def _items(value: Mapping[str, Any], key: str) -> dict[int, Item]:
     return {number: dict(item) for number, item in enumerate(listed) if isinstance(item, Mapping)}
 
 
-def _replace(found: CarriedOver, word: str, text_of: Callable[[str], str]) -> None:
-    """Put remarks in the place of an action's entries: those behind them keep their numbers, by which chance is drawn."""
-    for number, entry in found.timeline.items():
-        if entry.get("action") == word:
-            found.remarks.append(f"{_told('timeline', number, entry)}: {text_of(word)}")
-            found.timeline[number] = _stand_in(entry)
+def _replace_device_faults(found: CarriedOver, *, is_lockstep: bool) -> None:
+    """
+    Put remarks in the place of faults of devices: those behind them keep their numbers, by which chance is drawn.
+
+    That one is unplugged no sample tells: of lockstep, which knows when that was, it takes place again; so does what clears it.
+    What `delay` held back is on record as it came, though the device was closed by then: such a device is left open.
+    """
+    entries = {n: e for n, e in found.timeline.items() if e.get("action") == DEVICE_FAULT.word}
+    faults = [(e.get("device"), e.get("fault")) for e in entries.values()] if is_lockstep else []
+    for number, entry in entries.items():
+        device = entry.get("device")
+        is_unplugged = (device, "disconnect") in faults and (device, "delay") not in faults
+        if is_unplugged and entry.get("fault") in ("disconnect", "clear"):
+            continue
+        found.remarks.append(
+            f"{_told('timeline', number, entry)}: {DEVICE_FAULT.word} {IN_SAMPLES}"
+        )
+        # Its end clears the others, too.
+        found.timeline[number] = {**entry, **ALTERS_NOTHING} if is_unplugged else _stand_in(entry)
 
 
 def _stand_in(entry: Item) -> Item:

@@ -23,6 +23,8 @@ from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
 from madns_runtime.errors import MadnsError
+from madns_runtime.hardware.contract import Channel
+from madns_runtime.hardware.kinds.playback import streams_of
 from madns_runtime.plugin.queries import ask_rerun
 from madns_runtime.plugin.registry import is_shipped, parse_parameters, resolve
 from madns_runtime.recording.reader import read_stream
@@ -218,7 +220,7 @@ def _player(
         "directory": str(used.folder),
         "tick_hz": recorded.config.agents.tick_hz,
         "limits": {each.name: list(each.limits) for each in channels if each.limits is not None},
-        "queues": [each.name for each in channels if each.passing == "queue" and not each.is_frame],
+        "queues": [each.name for each in _queues(used, answer)],
     }
     newest = [each.name for each in channels if each.passing == "newest" and each.is_frame]
     if newest and recorded.config.time.is_lockstep:  # in real time no two are due at once
@@ -236,6 +238,15 @@ def _player(
         parameters=parameters,
         frozen_s=device.frozen_s if device else {},
     )
+
+
+def _queues(used: UsedDevice, answer: KindAnswer | None) -> list[Channel]:
+    """Return what passes each number once; of a kind that cannot be asked any input may, and its newest can be read, too."""
+    if answer is None:
+        found = [each for each, _ in streams_of(used.folder) if each.direction == "in"]
+    else:
+        found = [each for each in answer.channels if each.passing == "queue"]
+    return [each for each in found if not each.is_frame]
 
 
 def _ticks_played(

@@ -252,6 +252,42 @@ def test_a_playback_with_ticks_gives_each_sample_in_the_tick_that_could_find_it(
     assert len(found) == sum(each <= 0.35 + 1e-6 for each in handed_s)  # later ones nobody found
 
 
+def test_a_playback_of_lockstep_gives_a_sample_between_two_ticks_when_it_was_handed_on(tmp_path):
+    """And not with the next tick: a device that is unplugged in between has given it before."""
+    record(tmp_path, {"gyro": 0.0, "level": 0.0})
+    with opened("playback", tmp_path, directory=".", tick_hz=3.0) as device:
+        found_s = []
+        while (next_s := device.next_s()) < 0.4:
+            found_s.append(next_s)
+            device.sample_at(next_s)
+
+    assert found_s[2 * 16] == pytest.approx(0.320016, abs=1e-9)
+    (tmp_path / "third").mkdir()
+    (tmp_path / "third" / "level.jsonl").write_text(
+        (tmp_path / "level.jsonl").read_text().splitlines()[0]
+        + "\n[0.333333,1,0,1.5]\n[0.666667,2,0,1.5]\n"
+    )
+    with opened("playback", tmp_path, directory="third", tick_hz=3.0) as device:
+        assert device.next_s() == 1 / 3  # that tick's, on record in whole microseconds
+        device.sample_at(1 / 3)
+        assert device.next_s() == 2 / 3
+
+
+def test_a_sample_of_a_tick_of_lockstep_does_not_lie_behind_that_tick_as_its_time_was_rounded(
+    tmp_path,
+):
+    record(tmp_path, {"gyro": 0.0, "level": 0.0})
+    (tmp_path / "thirds").mkdir()
+    schema = (tmp_path / "level.jsonl").read_text().splitlines()[0]
+    samples = f"{schema}\n[0.333333,1,0,1.5]\n[0.666667,2,0,1.5]\n[0.8,3,0,1.5]\n"
+    (tmp_path / "thirds" / "level.jsonl").write_text(samples)
+
+    with opened("playback", tmp_path, directory="thirds", tick_hz=3.0) as device:
+        taken_s = [device.sample_at(1.0).taken_s for _ in range(3)]
+
+    assert taken_s == [1 / 3, 2 / 3, 0.8]
+
+
 def test_recorded_outputs_take_what_they_are_given_and_limits_are_told(tmp_path):
     fields = [("t_s", "s"), ("lateness_us", "us"), ("duty", "1")]
     told = ",".join(f'{{"name":"{name}","unit":"{unit}","kind":"float"}}' for name, unit in fields)

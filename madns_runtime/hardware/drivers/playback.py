@@ -6,6 +6,7 @@ import heapq
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,13 +24,12 @@ class PlaybackDevice(SimulatedDevice):
 
     def open(self) -> str:
         """Begin the recording."""
-        start_s, has_ticks = self.parameters.start_s, self.parameters.tick_hz is not None
         found_at = _finder(self.parameters)
         channels = streams_of(self.parameters.directory)
         self._has_inputs = any(channel.direction == "in" for channel, _ in channels)
         self._samples: Iterator[tuple[float, Sample]] = heapq.merge(
             *(
-                self._samples_of(channel, path, start_s, found_at, has_ticks=has_ticks)
+                self._samples_of(channel, path, found_at)
                 for channel, path in channels
                 if channel.direction == "in"
             ),
@@ -43,17 +43,11 @@ class PlaybackDevice(SimulatedDevice):
         self._samples, self._next = iter(()), None
 
     def _samples_of(
-        self,
-        channel: Channel,
-        path: Path,
-        start_s: float,
-        found_at: Callable[[float], float],
-        *,
-        has_ticks: bool,
+        self, channel: Channel, path: Path, found_at: Callable[[float], float]
     ) -> Iterator[tuple[float, Sample]]:
         """Yield the samples of one input with their times, and count the lines of its file that were none."""
         stream = read_stream(path)
-        yield from _samples(channel, stream, start_s, found_at, has_ticks=has_ticks)
+        yield from _samples(channel, stream, self.parameters, found_at)
         self.count("damaged_lines", stream.state.damaged + stream.state.truncated_lines)
 
     def sample_at(self, t_s: float) -> Sample | None:
@@ -79,10 +73,8 @@ class PlaybackDevice(SimulatedDevice):
 def _samples(
     channel: Channel,
     stream: StreamReading,
-    start_s: float,
+    parameters: PlaybackParameters,
     found_at: Callable[[float], float],
-    *,
-    has_ticks: bool,
 ) -> Iterator[tuple[float, Sample]]:
     """
     Yield the samples of one input with the simulated time at which each is handed on, s.
@@ -90,10 +82,14 @@ def _samples(
     Raises:
         PluginError: A record is no sample's.
     """
+    has_ticks = parameters.tick_hz is not None
+    is_lockstep = has_ticks and parameters.ticks is None
     for record in stream.records():
         t_s, _, age_us, *values = record
         try:
-            taken_s = t_s - start_s
+            taken_s = t_s - parameters.start_s
+            if is_lockstep:  # one of a tick itself must not lie behind that tick
+                taken_s = found_at(taken_s)
             handed_s = taken_s + age_us * 1e-6
             value: Any = values if channel.shape else values[0]
             if channel.is_frame:
@@ -114,13 +110,19 @@ def _samples(
         )
 
 
+def _meant(tick_hz: float, t_s: float) -> float:
+    """Return a time, s, or that of the tick beside which it lies by rounding alone."""
+    tick_s = round(t_s * tick_hz) / tick_hz
+    return tick_s if abs(t_s - tick_s) <= ROUNDING_S else t_s
+
+
 def _finder(parameters: PlaybackParameters) -> Callable[[float], float]:
     """Return what tells when in simulated time a sample is there that was handed on at a time, s."""
     tick_hz, start_s = parameters.tick_hz, parameters.start_s
     if tick_hz is None:
         return float
     if parameters.ticks is None:
-        return lambda handed_s: math.ceil((handed_s - ROUNDING_S) * tick_hz) / tick_hz
+        return partial(_meant, tick_hz)
     nominal_s: list[float] = []
     woke_s: list[float] = []
     for tick, lateness_us, *_ in read_stream(parameters.ticks).records():

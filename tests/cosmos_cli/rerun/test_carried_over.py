@@ -146,6 +146,40 @@ def test_a_remark_keeps_the_place_of_what_is_left_out_by_which_chance_is_drawn(f
     assert (found.left_out, len(found.remarks)) == (["kill"], 1)
 
 
+UNPLUGGED = """\
+name: flown
+simulation: counter
+agents: {count: 2, tick_hz: 10}
+time: {duration_s: 60}
+timeline:
+  - {at_s: 5.07, action: device_fault, agents: ["*"], device: imu, fault: disconnect}
+  - {at_s: 6, action: device_fault, agents: ["*"], device: imu, fault: bias, value: 2, for_s: 3}
+  - {at_s: 7, action: device_fault, agents: ["*"], device: gps, fault: bias, value: 2, for_s: 3}
+  - {at_s: 8, action: device_fault, agents: ["*"], device: imu, fault: clear}
+"""
+
+
+def test_in_lockstep_a_device_is_unplugged_again_as_no_sample_tells_it(flown):
+    found = carried_over(flown(59.9, mode="lockstep", text=UNPLUGGED))
+
+    unplugged, bias, other, clear = found.values()["timeline"]
+    assert (unplugged["at_s"], unplugged["fault"]) == (5.07, "disconnect")
+    assert (bias["fault"], bias["value"], bias["for_s"]) == ("drop", 0, 3)  # its end clears all
+    assert other["action"] == "annotate"
+    assert clear["fault"] == "clear"
+    assert [remark[:11] for remark in found.remarks] == ["timeline[1]", "timeline[2]"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "text"),
+    [("realtime", UNPLUGGED), ("lockstep", UNPLUGGED.replace("bias, value", "delay, value"))],
+)
+def test_a_device_is_not_unplugged_again_where_samples_may_have_come_behind_it(flown, mode, text):
+    found = carried_over(flown(59.9, mode=mode, text=text))
+
+    assert {entry["action"] for entry in found.values()["timeline"]} == {"annotate"}
+
+
 def test_a_run_whose_scenario_cannot_be_read_says_so(flown):
     found = carried_over(flown(59.9, text="timeline: [\n"))
 
