@@ -35,8 +35,8 @@ def device_changed(event: DeviceChanged) -> Command:
 
 
 def inject(order: FaultOrdered) -> Command:
-    """Return the order to insert a fault around a device; its answer bears the same number."""
-    return {**fault_recorded(order), "number": order.number}
+    """Return the order to insert a fault around a device; its answer bears the same number, beside the line's own."""
+    return {**fault_recorded(order), "order": order.number}
 
 
 def fault_recorded(order: FaultOrdered) -> Command:

@@ -257,7 +257,7 @@ _PARSERS: Mapping[str, Callable[[Mapping[str, Any]], Event]] = {
     "device": lambda d: DeviceChanged(
         _line(d["device"]), _line(d["status"]), _line(d.get("why") or "")
     ),
-    "injected": lambda d: FaultInserted(int(d["number"]), _line(d.get("refusal") or "")),
+    "injected": lambda d: FaultInserted(int(d["order"]), _line(d.get("refusal") or "")),
     "process": lambda d: ProcessKnown(int(d["pid"])),
     "loading": lambda d: Loading(str(d["doing"])),
     "pong": lambda d: PingAnswered(int(d["n"])),

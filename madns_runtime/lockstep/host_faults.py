@@ -24,6 +24,7 @@ class LockstepFaults:
 
     def __init__(self, core: LockstepCore, absences: Absences) -> None:
         self._goes_on = core.config.on_agent_loss == "continue"
+        self._duration_s = core.config.time.duration_s
         self._account = core.account
         self._absences = absences
         self._half = core.half
@@ -98,7 +99,11 @@ class LockstepFaults:
         returns_s = None if after_s is None else max(action.t_s, self._clock.t_s) + after_s
         for agent in agents:
             self._account.intended.order(agent, why, returns_s=returns_s)
-        fault = AgentFault(action.number, kinds.KILL, True, math.nan, why)
+        # As in real time: what is ordered is told, and one for which no tick would be left stays away.
+        will_return = returns_s is not None and returns_s < self._duration_s
+        ordered_s = 0.0 if action.word == kinds.RESTART else action.for_s
+        value = ordered_s if will_return and ordered_s is not None else math.nan
+        fault = AgentFault(action.number, kinds.KILL, True, value, why)
         self._absences.order(fault, agents)
         self._absences.take()
 

@@ -342,7 +342,7 @@ class Worker:
         self._clock.t_s = t_s
         for agent in [each for each in self._agents if each.index in indices]:
             if fault.word == KILL:
-                agent.journal.event("killed", reason=fault.reason)
+                agent.journal.event("killed", **fault.loss)
                 self._lose(agent, AgentFailed(agent.index, fault.reason))
                 continue
             faults = self._faults.setdefault(agent.index, StepFaults())

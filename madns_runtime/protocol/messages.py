@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from math import isnan
 from typing import Any, ClassVar, get_args
 
 VERSION = 1
@@ -226,6 +227,12 @@ class AgentFault:
     value: float
     """The factor of slow; of kill and restart the time until the return, s, not a number for never."""
     reason: str = ""
+
+    @property
+    def loss(self) -> dict[str, Any]:
+        """Return what events tell of a loss: why, and the time until the return, s, None for never."""
+        after_s = None if isnan(self.value) else self.value
+        return {"reason": self.reason, "returns_after_s": after_s}
 
 
 Message = (

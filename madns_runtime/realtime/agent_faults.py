@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 from madns_runtime.protocol.messages import AgentFault
@@ -35,9 +34,8 @@ class AgentFaults:
     def take(self, order: AgentFault) -> None:
         """Begin or end a fault."""
         if order.word in LOSSES:
-            after_s = None if math.isnan(order.value) else order.value
-            self._journal.event("killed", reason=order.reason, returns_after_s=after_s)
-            self._killed(order.reason, after_s)
+            self._journal.event("killed", **order.loss)
+            self._killed(order.reason, order.loss["returns_after_s"])
             return
         faults = self._ticks.hinder(order)
         if faults is None:

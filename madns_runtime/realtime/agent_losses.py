@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from madns_runtime.protocol.events import AgentLost
+from madns_runtime.protocol.events import AgentLost, AgentMoved, Phase
 from madns_runtime.realtime.announcements import Announcements
 from madns_runtime.realtime.host_core import RealtimeCore
 from madns_runtime.realtime.host_faults import HostFaults
@@ -40,6 +40,11 @@ class AgentLosses:
         self._call = call
         self._now_s = core.port.now_s
         self._reasons: dict[str, str] = {}
+
+    def moved(self, event: AgentMoved) -> None:
+        """Tell the new phase of an agent; of a loss that was ordered, that it was, as in lockstep."""
+        is_intended = event.phase is Phase.LOST and self._faults.intended.is_coming(event.agent)
+        self._announced.agent_moved(event, is_intended=is_intended)
 
     def lost(self, loss: AgentLost, *, may_tell: bool) -> None:
         """Note a loss, and tell the half of it if that can take it."""

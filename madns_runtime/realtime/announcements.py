@@ -29,13 +29,14 @@ class Announcements:
         self._journal.event("state", state=state.value)
         self._emit({"event": "state", "state": state.value})
 
-    def agent_moved(self, event: AgentMoved) -> None:
-        """Tell the new phase of an agent."""
+    def agent_moved(self, event: AgentMoved, *, is_intended: bool = False) -> None:
+        """Tell the new phase of an agent; *is_intended* of one that is lost on purpose."""
         moved = {
             "agent": event.agent,
             "state": event.phase.value,
             "reason": event.reason,
             "incarnation": event.incarnation,
+            **({"is_intended": True} if is_intended else {}),
         }
         self._journal.event("agent", **moved)
         self._emit({"event": "agent", **moved})

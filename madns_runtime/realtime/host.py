@@ -216,7 +216,7 @@ class HostRuntime:
             case told.HostStateEntered(state):
                 self._announced.state(state)
             case told.AgentMoved():
-                self._announced.agent_moved(event)
+                self._losses.moved(event)
             case told.AgentsReady():
                 self._set_up()
             case told.AgentsSimulationReady():

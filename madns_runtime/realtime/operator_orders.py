@@ -47,6 +47,7 @@ class OperatorOrders:
                 level = "error" if status == "lost" else "info"
                 self._journal.say(level, f"device {device}: {status} {why or ''}".rstrip())
             case {"command": "inject", **fault}:
+                fault.pop("number", None)  # that of a line between machines
                 self._journal.event("fault", **fault)
             case {"command": "agent_exited"}:
                 pid = None if order.get("pid") is None else int(order["pid"])

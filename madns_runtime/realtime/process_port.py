@@ -97,7 +97,8 @@ class ProcessPort:
         interval_s = min(PING_INTERVAL_S * slowed, self._silence_s / PINGS_PER_SILENCE)
         return PingPlan(
             brings_clock_up=number == 0,
-            delay_s=interval_s * (number + 1) / self.agents,
+            # One that returns takes a place, too: beyond an interval it would be silent until it is lost.
+            delay_s=interval_s * (number % self.agents + 1) / self.agents,
             interval_s=interval_s,
         )
 

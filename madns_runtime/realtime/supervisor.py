@@ -342,7 +342,7 @@ class Supervisor:
         """Put a fault in force around a device, and say what became of the order."""
         target, action, value = command.get("target"), command.get("action"), command.get("value")
         refusal = self._devices.insert_fault(str(target), str(action), value)
-        told = {"event": "injected", "number": command.get("number"), "refusal": refusal}
+        told = {"event": "injected", "order": command.get("order"), "refusal": refusal}
         self._operator.emit({**told, "target": target, "action": action})
 
     def _end(self, reason: str) -> None:

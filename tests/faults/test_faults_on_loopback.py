@@ -77,8 +77,8 @@ def test_processes_that_are_killed_on_purpose_return_and_cost_no_verdict(laborat
     # Back at the present time, with the ticks between it and the kill never its own.
     assert 20 <= ticks(folder, "agent-01", ".2")[0] <= 85
     assert ticks(folder, "agent-02")[-1:] < [60]
-    reasons = [e["reason"] for e in events(folder, "host") if e.get("state") == "lost"]
-    assert reasons == ["killed by SIGKILL"] * 3
+    lost = [e for e in events(folder, "host") if e.get("state") == "lost"]
+    assert [(e["reason"], e["is_intended"]) for e in lost] == [("killed by SIGKILL", True)] * 3
     own = {e["event"]: e for e in events(folder, "agents/agent-03")}
     assert own["hang_ends"]["ticks_withheld"] > 0
     counts = result["faults"]["agents"]["agent-04"]

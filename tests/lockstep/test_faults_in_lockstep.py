@@ -125,6 +125,11 @@ KINDS = {
 """Twenty kinds of faults, by name, and one that lasts until the run is stopped."""
 
 
+def returns_after_s(run):
+    events = run.events_of("agents/agent-04")
+    return next(e["returns_after_s"] for e in events if e["event"] == "killed")
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_with_a_fault_survives_it_and_repeats_to_the_bit(run_faults, kind):
     runs = [run_faults(*KINDS[kind], per_process=number) for number in (2, 6)]
@@ -170,6 +175,17 @@ def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_f
     assert at_host(run, kind="rejoined") == [(0.6, [])]
     said = [e["event"] for e in run.events_of("agents/agent-04")]
     assert said == ["start", "killed", "emergency", "end"]
+    assert returns_after_s(run) == 0.3
+
+
+@pytest.mark.parametrize(
+    ("action", "for_s", "told_s"), [("kill", None, None), ("kill", 0.9, None), ("restart", None, 0)]
+)
+def test_an_agent_records_when_it_is_to_return_as_in_real_time(run_faults, action, for_s, told_s):
+    run = run_faults(entry(action, for_s=for_s))
+    run.result()
+
+    assert returns_after_s(run) == told_s
 
 
 @pytest.mark.parametrize("timeline", [[], [entry("stop", (), at_s=0.5)]])

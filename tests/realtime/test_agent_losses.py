@@ -5,8 +5,10 @@ from typing import Any
 
 import pytest
 
-from madns_runtime.protocol.events import AgentLost
+from madns_runtime.faults.intended_losses import IntendedLosses
+from madns_runtime.protocol.events import AgentLost, AgentMoved, Phase
 from madns_runtime.realtime.agent_losses import AgentLosses
+from madns_runtime.realtime.announcements import Announcements
 
 WHY = "killed on purpose at t = 3 s"
 
@@ -30,3 +32,29 @@ def test_the_half_is_told_why_an_agent_is_lost_on_purpose_whoever_shared_its_pro
 
     assert heard == [("agent_lost", "a", told)]
     assert (report.intended_lost if ordered else report.lost) == {"a": told}
+
+
+@pytest.mark.parametrize("phase", [Phase.LOST, Phase.RUNNING])
+@pytest.mark.parametrize("is_ordered", [True, False])
+def test_the_event_of_a_loss_on_purpose_says_so_as_in_lockstep(
+    phase: Phase, is_ordered: bool
+) -> None:
+    told: list[dict[str, object]] = []
+    journal: Any = SimpleNamespace(event=lambda word, **values: told.append(values))
+    core: Any = SimpleNamespace(journal=journal, port=SimpleNamespace(now_s=lambda: 3.0))
+    intended = IntendedLosses()
+    if is_ordered:
+        intended.order("a", WHY, returns_s=None)
+    losses = AgentLosses(
+        core,
+        SimpleNamespace(),  # type: ignore[arg-type]
+        faults=SimpleNamespace(intended=intended),  # type: ignore[arg-type]
+        announced=Announcements(journal, lambda event: None),
+        call=print,
+    )
+
+    losses.moved(AgentMoved("a", phase, "killed by SIGKILL", 1))
+
+    plain = {"agent": "a", "state": phase.value, "incarnation": 1, "reason": "killed by SIGKILL"}
+    is_told = is_ordered and phase is Phase.LOST
+    assert told == [{**plain, "is_intended": True} if is_told else plain]

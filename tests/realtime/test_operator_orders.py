@@ -43,7 +43,7 @@ class Stage:
             ],
         ),
         (
-            {"command": "inject", "target": "pi/imu", "action": "freeze"},
+            {"command": "inject", "target": "pi/imu", "action": "freeze", "number": 3},
             [("event", "fault", {"target": "pi/imu", "action": "freeze"})],
         ),
         (

@@ -233,3 +233,11 @@ def test_no_agent_is_silent_for_as_long_as_makes_it_lost(host, agents, silence_s
     longest_s = max(plan.next_s(0.0, at_s / 100) - at_s / 100 for at_s in range(1000)) + slack_s
 
     assert longest_s < 0.81 * silence_s
+
+
+def test_agent_that_has_returned_often_says_how_it_is_within_an_interval(host):
+    port = port_of(host, 2)
+    plans = [port.pings() for _ in range(100)]
+
+    assert max(plan.delay_s for plan in plans) <= PING_INTERVAL_S
+    assert [plan.brings_clock_up for plan in plans] == [True, *[False] * 99]

@@ -82,7 +82,7 @@ def test_exit_on_purpose_is_told_as_such() -> None:
 
 
 def test_what_became_of_an_order_bears_its_number() -> None:
-    line = b'{"event":"injected","number":3,"refusal":null,"target":"pi01/imu","action":"freeze"}'
+    line = b'{"event":"injected","number":9,"order":3,"refusal":null,"target":"pi01/imu","action":"freeze"}'
 
     assert parse_event(line) == FaultInserted(3, "")
 

@@ -5,11 +5,17 @@ from __future__ import annotations
 import json
 import os
 import selectors
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from cosmos_cli.launch.child_commands import inject
+from cosmos_cli.launch.events import FaultInserted, parse_event
 from cosmos_cli.launch.remote_line import RemoteLine
+from cosmos_cli.launch.run_events import FaultOrdered
+from madns_runtime.reactor.reattachment import KeptEvents
+from madns_runtime.realtime.supervisor import Supervisor
 
 
 class PipeStream:
@@ -154,3 +160,18 @@ def test_line_that_makes_no_sense_is_passed_on(line: bytes) -> None:
     made.attach(PipeStream(), line + b"\n")
 
     assert lines == [line]
+
+
+def test_an_order_and_its_answer_keep_their_number_beside_those_of_the_line(stage: Stage) -> None:
+    stream, said = PipeStream(), list[bytes]()
+    supervisor, events = Supervisor.__new__(Supervisor), KeptEvents()
+    supervisor._devices = SimpleNamespace(insert_fault=lambda *fault: "")  # type: ignore[assignment]
+    supervisor._operator = SimpleNamespace(  # type: ignore[assignment]
+        emit=lambda event: said.append(events.add(event))
+    )
+    stage.line.open(stream)
+    stage.line.send(inject(FaultOrdered(7, "pi01/imu", "freeze", None)))
+
+    supervisor._inject(stream.commands[0])
+
+    assert parse_event(said[0]) == FaultInserted(7, "")

@@ -815,7 +815,7 @@ def test_a_fault_is_passed_to_who_drives_the_device_and_its_answer_told_and_reco
     told = table.play((1, ChildSaid(AGENTS, events.FaultInserted(1, ""))))
 
     order = {"command": "inject", "target": "pi01/imu", "action": "freeze", "value": None}
-    assert actions.Send(AGENTS, {**order, "number": 1}) in asked
+    assert actions.Send(AGENTS, {**order, "order": 1}) in asked
     assert not answers(asked)
     assert answers(told) == [(1, "")]
     assert orders(told, "inject") == [{**order, "refusal": ""}]
