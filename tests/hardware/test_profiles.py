@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 
@@ -144,6 +145,16 @@ def test_points_travel_in_messages_of_a_bounded_size():
 def test_what_is_no_profile_is_refused_where_it_is_handed_over(points, what):
     with pytest.raises(PluginError, match=what):
         pack_points(COIL, points)
+
+
+def test_points_without_end_are_refused_after_as_many_as_there_may_be():
+    taken = itertools.count()
+
+    with pytest.raises(PluginError, match="at most 10000 points"):
+        pack_points(
+            LINE, ((float(k), 1.0) for k in itertools.takewhile(lambda k: k < 10**5, taken))
+        )
+    assert next(taken) <= POINTS_MAX + 1
 
 
 def test_a_write_before_simulated_time_is_known_ends_a_profile_as_one_after_it():
