@@ -155,9 +155,10 @@ def field_at_t(place: str) -> float:
 
 def pasteable(device: str, found: Sequence[SensorCalibration]) -> str:
     """Return what to paste into a vehicle of a scenario; empty for nothing."""
+    name = device.rpartition("/")[2]  # a scenario names no machine: each agent has its own device
     lines = []
     for each in found:
-        settings = {"device": f"{device}.{each.channel}", **each.settings()}
+        settings = {"device": f"{name}.{each.channel}", **each.settings()}
         inner = ", ".join(f"{key}: {value}" for key, value in settings.items())
         lines.append(f"  {each.sensor}: {{{inner}}}")
     return "\n".join(["sensors:", *lines]) if lines else ""

@@ -20,7 +20,7 @@ from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.seat import DeviceSeat
-from madns_runtime.hardware.status import StatusAccount, StatusLimits
+from madns_runtime.hardware.status import StatusAccount, StatusLimits, limits_of, sample_period_s
 from madns_runtime.reactor.descriptors import allow_descriptors, ready
 
 NOT_MADE_SAFE: Final = "could not be made safe: its driver failed, look at the device"
@@ -67,7 +67,7 @@ class DrivenDevice:
         )
         return cls(
             seat=seat,
-            limits=StatusLimits.of(1.0 / launch.rate_hz, launch.hang_s),
+            limits=limits_of(launch, program.channels),
             ends={agent: pair[0] for agent, pair in pairs.items()},
         )
 
@@ -123,10 +123,14 @@ class DrivenDevice:
             return f"it has not opened within {self.limits.lost_s:g} s"
         if state == page.OPEN:
             rate_hz = self.seat.launch.rate_hz
+            period_s = sample_period_s(rate_hz, self.seat.channels)
+            promise = f"rate_hz ({rate_hz:g})"
+            if period_s > 1.0 / rate_hz:
+                promise = "its fastest input"
             counts = self.seat.page.counts.read().items()
             told = [f"{name} {n}" for name, n in counts if n and name.endswith(TELLING)]
             return (
-                f"no sample for {self.limits.lost_s:g} s, where rate_hz ({rate_hz:g}) promises one every {1 / rate_hz:g} s"
+                f"no sample for {self.limits.lost_s:g} s, where {promise} promises one every {period_s:g} s"
                 f"{'; so far ' if told else ''}{', '.join(told)}"
             )
         return DISCONNECTED if "disconnect" in self.faults else "it is closed"

@@ -19,7 +19,7 @@ from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.simulated import STANDS_STILL, next_of
-from madns_runtime.hardware.status import StatusAccount, StatusLimits
+from madns_runtime.hardware.status import StatusAccount, limits_of
 from madns_runtime.plugin.context import describe_exception
 
 RECORDS_TIMEOUT_S: Final = 10.0
@@ -60,7 +60,7 @@ class InlineDevice:
         self._device = device
         self._records = records
         self._page = DevicePage([each for each in program.channels if each.direction == "in"])
-        self._limits = StatusLimits.of(1.0 / launch.rate_hz, launch.hang_s)
+        self._limits = limits_of(launch, program.channels)
         self._account = StatusAccount()
         self._rate_hz = launch.rate_hz
         self._count = 0

@@ -6,6 +6,7 @@ Writes are due on the clock of whoever drives the device, points of profiles at 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -93,7 +94,8 @@ class DeviceOutputs:
             raise PluginError(f"{name}: too many values wait for their time")
         self._count("writes_replaced", self._pending.replaced - replaced)
         if channel.passing == "newest" and (profile := self._profiles.get(name)) is not None:
-            profile.replace(t_s, (), t_s)
+            # Before simulated time is known all of it is still to come.
+            profile.replace(-math.inf if math.isnan(t_s) else t_s, (), t_s)
 
     def take_profile(
         self, agent: str, name: str, from_s: float, data: bytes, *, t_s: float

@@ -98,12 +98,12 @@ def pack_points(channel: Channel, points: Iterable[tuple[float, Any]]) -> list[a
                 f"{channel.name}: expected points in order of time, got {t_s!r:.40} s after {last_s:g} s"
             )
         count, last_s = count + 1, t_s
+        if count > POINTS_MAX:  # at once: a generator may have no end
+            raise PluginError(f"{channel.name}: expected at most {POINTS_MAX} points, got more")
         if len(packs[-1]) >= each_max:
             packs.append(array("d"))
         packs[-1].append(t_s)
         packs[-1].extend(numbers)
-    if count > POINTS_MAX:
-        raise PluginError(f"{channel.name}: expected at most {POINTS_MAX} points, got {count}")
     return packs
 
 

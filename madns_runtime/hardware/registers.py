@@ -17,7 +17,7 @@ from annotated_types import Ge, Le, MinLen
 
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.hardware.contract import Channel, Device, Sample, Value
-from madns_runtime.hardware.values import check_range, to_numbers
+from madns_runtime.hardware.values import check_range, nearest_whole, to_numbers
 
 RegisterType = Literal[
     "u8", "i8", "u16_le", "u16_be", "i16_le", "i16_be", "u24_le", "u24_be", "i24_le", "i24_be",
@@ -250,10 +250,12 @@ class RegisterDevice(Device):
     def _put(self, register: Register, value: Any) -> None:
         assert self._bus is not None
         channel = register_channels([register])[0]
-        raw = [
-            (number - register.offset) / register.scale
-            for number in to_numbers(channel, value if register.count > 1 else _first(value))
-        ]
+        numbers = to_numbers(channel, value if register.count > 1 else _first(value))
+        raw = [(number - register.offset) / register.scale for number in numbers]
+        if channel.limits is not None and not register.type.startswith("f"):
+            first, last = ((each - register.offset) / register.scale for each in channel.limits)
+            # Infinite ones are held to what the register can hold.
+            raw = [nearest_whole(n, (first, last)) if math.isfinite(n) else n for n in raw]
         data = b"".join(encode_number(register.type, number, register.shift) for number in raw)
         self._bus.write(register.address, data)
 

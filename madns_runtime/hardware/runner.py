@@ -20,7 +20,7 @@ from madns_runtime.hardware.process_resources import has_descriptors, leak_of, r
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.simulated import next_of, pass_over, samples_by_now
-from madns_runtime.hardware.status import StatusLimits, back_off_s
+from madns_runtime.hardware.status import LOST_PERIODS, back_off_s, limits_of, sample_period_s
 from madns_runtime.reactor.reactor import Reactor
 
 BURST_MAX: Final = 256
@@ -69,7 +69,9 @@ class DeviceRunner:
         """Memory of this process when the device was opened first; 0 before."""
         self._is_own = False
         self._period_s = 1.0 / launch.rate_hz
-        self._hang_s = StatusLimits.of(self._period_s, launch.hang_s).hang_s
+        self._hang_s = limits_of(launch, seat.channels).hang_s
+        sample_s = sample_period_s(launch.rate_hz, seat.channels)
+        self._silent_s = max(self._hang_s, LOST_PERIODS * sample_s)
         self._due_s = math.inf
         self._next_s: float | None = None  # of a device that follows simulated time
         # Infinite is never: each timer is made once and moved.
@@ -366,8 +368,8 @@ class DeviceRunner:
         header = self._header
         heard_s = max(header[page.ARRIVED_S], self._intake.withheld_s)
         silent_s = now_s - max(heard_s, header[page.OPENED_S])
-        if self._device is not None and silent_s > self._hang_s:
-            self._fail("read", MachineError(f"no sample within {self._hang_s:g} s"))
+        if self._device is not None and silent_s > self._silent_s:
+            self._fail("read", MachineError(f"no sample within {self._silent_s:g} s"))
         if self._device is not None:
             try:
                 details = driver_answers.details_of(self._device.health())

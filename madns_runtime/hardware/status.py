@@ -3,13 +3,17 @@ Status of a device as its users see it, and when its process is given up. Pure: 
 
 *never*: open, no sample yet. *ok*. *stale*: the newest sample is older than 3 periods, and than 0.1 s.
 *lost*: no sample for 10 periods and 1 s, closed, or *never* for that long.
+A period is `sample_period_s`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from madns_runtime.config import DeviceLaunch
+from madns_runtime.hardware.contract import Channel
 from madns_runtime.plugin.device_view import DeviceStatus
 
 STALE_PERIODS = 3.0
@@ -29,11 +33,12 @@ class StatusLimits:
     hang_s: float
 
     @classmethod
-    def of(cls, period_s: float, hang_s: float) -> StatusLimits:
-        """Return the limits of a device that is read every *period_s* seconds."""
+    def of(cls, period_s: float, hang_s: float, sample_s: float = 0.0) -> StatusLimits:
+        """Return the limits of a device that is read every *period_s* seconds and gives samples every *sample_s*, if that is longer."""
+        slow_s = max(period_s, sample_s)
         return cls(
-            stale_s=max(STALE_PERIODS * period_s, STALE_S_MIN),
-            lost_s=max(LOST_PERIODS * period_s, LOST_S_MIN),
+            stale_s=max(STALE_PERIODS * slow_s, STALE_S_MIN),
+            lost_s=max(LOST_PERIODS * slow_s, LOST_S_MIN),
             hang_s=max(hang_s, LOST_PERIODS * period_s),
         )
 
@@ -56,6 +61,31 @@ class StatusLimits:
         if age_s <= self.stale_s:
             return "ok"
         return "stale" if silent_s <= self.lost_s else "lost"
+
+
+def sample_period_s(rate_hz: float, channels: Sequence[Channel]) -> float:
+    """
+    Return the time from one sample of a device to the next, s: of its reads, or longer where all its inputs are slower.
+
+    Args:
+        rate_hz: At which it is read.
+        channels: The device's; inputs of frames and queues promise no rate.
+    """
+    rates = [
+        each.rate_hz_max
+        for each in channels
+        if each.direction == "in" and each.passing == "newest" and not each.is_frame
+    ]
+    fastest_hz = max(
+        (rate if rate and rate > 0.0 else math.inf for rate in rates), default=math.inf
+    )
+    return 1.0 / min(rate_hz, fastest_hz)
+
+
+def limits_of(launch: DeviceLaunch, channels: Sequence[Channel]) -> StatusLimits:
+    """Return the limits of a device with such channels."""
+    sample_s = sample_period_s(launch.rate_hz, channels)
+    return StatusLimits.of(1.0 / launch.rate_hz, launch.hang_s, sample_s)
 
 
 def back_off_s(failures: int) -> float:

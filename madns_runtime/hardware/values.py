@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence, Set
-from typing import Any
+from typing import Any, Final
 
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel
+
+EDGE_ROUNDING: Final = 1e-9
+"""Share of a digit, and of a limit, that arithmetic may cost."""
 
 
 def to_numbers(channel: Channel, value: Any) -> tuple[float, ...]:
@@ -67,6 +70,24 @@ def hold_to_limits(channel: Channel, numbers: Sequence[float]) -> tuple[tuple[fl
     low, high = channel.limits
     held = tuple(min(max(number, low), high) for number in numbers)
     return held, held != tuple(numbers)
+
+
+def nearest_whole(number: float, edges: tuple[float, float]) -> int:
+    """
+    Return the whole number nearest to a finite one; of one between two edges none beyond them, if there is one between.
+
+    Args:
+        number: In digits of a register or converter.
+        edges: The limits of its channel in the same, in any order.
+    """
+    nearest, low, high = round(number), min(edges), max(edges)
+    if not low <= number <= high:
+        return nearest
+    # The edges are quotients: one of 6.999999999999999 is 7.
+    low -= EDGE_ROUNDING * max(1.0, abs(low))
+    high += EDGE_ROUNDING * max(1.0, abs(high))
+    other = nearest - 1 if nearest > high else nearest + 1
+    return other if not low <= nearest <= high and low <= other <= high else nearest
 
 
 def to_output(channel: Channel, value: Any) -> tuple[Any, bool]:

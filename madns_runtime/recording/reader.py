@@ -73,6 +73,8 @@ class StreamReading:
         """Line 1; empty if the file has none."""
         self._first_bytes = len(first) if self.schema else 0
         self._state: StreamState | None = None
+        self.passed = StreamState()
+        """Result so far of the newest pass over the records, which need not have come to the end."""
 
     @property
     def state(self) -> StreamState:
@@ -105,6 +107,7 @@ class StreamReading:
     def chunks(self) -> Iterator[list[Any]]:
         """Give the records in lists of what one block of the file holds."""
         decoder = _Decoder(self.schema)
+        self.passed = decoder.state
         for block, is_last in self._blocks():
             yield decoder.decode(block, is_last=is_last)
         self._state = decoder.state

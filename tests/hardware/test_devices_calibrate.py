@@ -83,11 +83,14 @@ def turned(strength: float) -> Any:
     return strength * ways / np.linalg.norm(ways, axis=1, keepdims=True)
 
 
-def test_a_recording_at_rest_gives_lines_that_a_scenario_takes(told: Told, tmp_path: Path) -> None:
+@pytest.mark.parametrize("device", ["imu", "here/imu"])
+def test_a_recording_at_rest_gives_lines_that_a_scenario_takes(
+    told: Told, tmp_path: Path, device: str
+) -> None:
     values = np.array([0.5, -0.25, 0.0]) + noise(200, 0.02)
     folder = recording(tmp_path / "rest", values, channel="rate", unit="deg/s")
 
-    code, found = told("imu", "gyro", "--from", folder)
+    code, found = told(device, "gyro", "--from", folder)
 
     assert code == 0
     (gyro,) = found["sensors"]
@@ -220,11 +223,11 @@ def test_what_was_done_before_ctrl_c_is_shown_and_nothing_is_left(
 
     monkeypatch.setattr(devices_calibrate, "wait_for_enter", interrupt)
 
-    code = cosmos(["devices", "calibrate", "imu", "-i", str(inventory), "--seconds", "2.0"])
+    code = cosmos(["devices", "calibrate", "here/imu", "-i", str(inventory), "--seconds", "2.0"])
 
     printed = capsys.readouterr()
     assert code == 130
-    assert "accelerometer of imu was interrupted: nothing of it is kept" in printed.err
+    assert "accelerometer of here/imu was interrupted: nothing of it is kept" in printed.err
     assert "gyro: {device: imu.rate" in printed.out
     assert "accelerometer: {" not in printed.out
     assert list(kept.iterdir()) == []

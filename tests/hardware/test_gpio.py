@@ -81,6 +81,10 @@ def requests(monkeypatch):
             raise ValueError("line offset of out range")  # gpiod's own word
         if taken & set(config):
             raise OSError(errno.EBUSY, "Device or resource busy")
+        kinds = gpiod.line
+        for line in config.values():  # Linux, gpiolib-cdev.c: "Bias requires explicit direction."
+            if line.direction == kinds.Direction.AS_IS and line.bias != kinds.Bias.AS_IS:
+                raise OSError(errno.EINVAL, "Invalid argument")
         made.append(Request(config))
         return made[-1]
 
@@ -111,6 +115,16 @@ def test_levels_with_bias_and_outputs_with_their_safe_state(requests):
         device.make_safe()
         assert request.values[3] == Value.ACTIVE
     assert request.is_released
+
+
+def test_an_output_that_may_not_move_keeps_its_bias_and_direction(requests):
+    made, _ = requests
+    lines = [{"name": "valve", "offset": 3, "mode": "output", "bias": "pull_down"}]
+    with opened("gpio", may_move=False, lines=lines) as device:
+        assert made[0].config[3].direction == gpiod.line.Direction.AS_IS
+        assert device.read().values == {}
+    with opened("gpio", lines=lines):
+        assert made[1].config[3].bias == gpiod.line.Bias.PULL_DOWN
 
 
 def test_edges_come_in_order_at_the_kernels_times(requests):

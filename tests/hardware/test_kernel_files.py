@@ -88,6 +88,14 @@ def test_analog_outputs_are_written_raw_and_made_safe(converter):
         assert not converter.exists()
 
 
+def test_no_whole_digit_brings_an_analog_output_beyond_its_limits(converter):
+    volts = {"name": "volts", "file": "out_voltage0_raw", "is_output": True, "low": 0, "high": 0.9}
+    with opened("analog", root=str(converter.parent), inputs=[volts]) as device:
+        device.write({"volts": 0.9}, 0.0)  # 1.8 digits of 0.5
+
+    assert (converter / "out_voltage0_raw").read_text() == "1"
+
+
 def test_a_value_that_the_converter_does_not_take_is_refused_and_it_stays_open(
     converter, monkeypatch
 ):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 
 import pytest
 
+from madns_runtime.config import DeviceLaunch
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware import profiles
 from madns_runtime.hardware.contract import NAME_CHARACTERS_MAX, Channel
@@ -14,6 +16,7 @@ from madns_runtime.hardware.count_table import NAME_BYTES, NOT_FINITE, REST, mis
 from madns_runtime.hardware.intake import FROZEN
 from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.hardware.outbox import USERS_NAMED_MAX
+from madns_runtime.hardware.outputs import DeviceOutputs
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import (
     POINT_COUNTS,
@@ -142,6 +145,30 @@ def test_points_travel_in_messages_of_a_bounded_size():
 def test_what_is_no_profile_is_refused_where_it_is_handed_over(points, what):
     with pytest.raises(PluginError, match=what):
         pack_points(COIL, points)
+
+
+def test_points_without_end_are_refused_after_as_many_as_there_may_be():
+    taken = itertools.count()
+
+    with pytest.raises(PluginError, match="at most 10000 points"):
+        pack_points(
+            LINE, ((float(k), 1.0) for k in itertools.takewhile(lambda k: k < 10**5, taken))
+        )
+    assert next(taken) <= POINTS_MAX + 1
+
+
+def test_a_write_before_simulated_time_is_known_ends_a_profile_as_one_after_it():
+    launch = DeviceLaunch(
+        name="d", place="m", kind="null", base_directory="", rate_hz=10, owner="a", may_move=True
+    )
+    counts = Counter()
+    outputs = DeviceOutputs(launch, [BRAKE], lambda *told: counts.update(dict([told])))
+    [pack] = pack_points(BRAKE, ramp(0.0, 3))
+    outputs.take_profile("a", "brake", 0.0, pack.tobytes(), t_s=math.nan)
+    outputs.take_write("a", "brake", 0.5, 0.0, t_s=math.nan)
+
+    assert [each.value for each in outputs.due(1.0, 1.0, float)] == [0.5]
+    assert counts[count_name("replaced", "brake")] == 3
 
 
 def test_bytes_that_are_no_points_are_refused():

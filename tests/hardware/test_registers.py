@@ -203,6 +203,24 @@ def test_outputs_are_scaled_and_made_safe():
         assert device.read().values == {}  # outputs alone: it is there
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "scale", "value", "raw"),
+    [
+        (0, 6, 4.0, 6.0, 1),  # 1.5 digits: 2 would be 8
+        (-6, 6, -4.0, -6.0, 1),
+        (3, 9, 4.0, 3.0, 1),  # 0.75 digits
+        (0.0, 0.7, 0.1, 0.7, 7),  # 6.999999999999999 digits
+        (5, 7, 4.0, 5.5, 1),  # no digit is inside: the nearest
+    ],
+)
+def test_no_whole_digit_brings_a_value_beyond_its_limits(low, high, scale, value, raw):
+    output = {**OUTPUT, "low": low, "high": high, "scale": scale, "safe": None}
+    with opened("i2c", address=0x19, map={"registers": [output]}) as device:
+        device.write({"angle": value}, 0.0)
+
+    assert int.from_bytes(CHIP[0x30:0x32], "big", signed=True) == raw
+
+
 def test_a_period_keeps_a_register_from_being_read_each_time():
     slow = {"name": "slow", "address": 1, "period_s": 100.0}
     registers = [slow, {"name": "fast", "address": 2}]

@@ -106,3 +106,21 @@ def test_a_line_that_is_pulled_out_is_gone(line):
     with pytest.raises(MachineError, match="/dev/pts/.* is gone"):
         for _ in range(3):
             device.read()
+
+
+@pytest.mark.parametrize("number", ["A50285BI", ""])
+def test_the_identity_is_the_adapters_own_number_and_no_hubs(tmp_path, monkeypatch, number):
+    # As Linux has it: a hub, and the controller behind all of them, are USB devices with numbers of their own.
+    controller = tmp_path / "devices" / "usb1"
+    adapter = controller / "1-1"
+    port = adapter / "1-1:1.0" / "ttyUSB7"
+    port.mkdir(parents=True)
+    for device, own in ((controller, "0000:01:00.0"), (adapter, number)):
+        (device / "idVendor").write_text("0403\n")
+        if own:
+            (device / "serial").write_text(f"{own}\n")
+    (tmp_path / "tty" / "ttyUSB7").mkdir(parents=True)
+    (tmp_path / "tty" / "ttyUSB7" / "device").symlink_to(port)
+    monkeypatch.setattr(driver, "TTY_FOLDER", str(tmp_path / "tty"))
+
+    assert driver._adapter_serial("/dev/ttyUSB7") == number

@@ -222,6 +222,19 @@ def test_lines_of_a_recording_that_are_none_are_counted_and_records_of_another_k
         pass
 
 
+def test_lines_that_are_none_are_counted_of_a_recording_that_is_not_played_to_its_end(tmp_path):
+    record(tmp_path, {"gyro": 0.0015, "level": 0.03})
+    path, counts = tmp_path / "level.jsonl", {}
+    head, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([head, *lines[:5], "[0.1,6", *lines[6:]]))
+    with opened("playback", tmp_path, directory=".") as device:
+        device.count = lambda name, number: counts.update({name: counts.get(name, 0) + number})
+        while device.sample_at(1.0) is not None:
+            pass
+
+    assert counts == {"damaged_lines": 1}
+
+
 def test_a_playback_begins_where_it_is_told_and_refuses_an_empty_folder(tmp_path):
     record(tmp_path, {"gyro": 0.0, "level": 0.0})
     with opened("playback", tmp_path, directory=".", start_s=2.0) as device:

@@ -6,7 +6,13 @@ import math
 
 import pytest
 
+from madns_runtime.config import DeviceLaunch
+from madns_runtime.hardware.driven import DrivenDevice
+from madns_runtime.hardware.kind_registry import prepare
 from madns_runtime.hardware.status import StatusAccount, StatusLimits, back_off_s
+
+NO_INERTIA = {"accelerometer": False, "gyroscope": False, "magnetometer": False}
+SLOW = {"name": "level", "address": 1}
 
 
 @pytest.mark.parametrize(
@@ -79,3 +85,20 @@ def test_a_device_that_is_lost_when_the_run_begins_is_a_loss():
 
     assert account.times_lost == 1
     assert account.stale_ratio() is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "rate_hz", "lost_s"),
+    [
+        ("sense_hat", {}, 20.0, 1.0),
+        ("sense_hat", {**NO_INERTIA, "joystick": True}, 20.0, 10.0),
+        ("i2c", {"address": 25, "map": {"registers": [{**SLOW, "period_s": 5.0}]}}, 10.0, 50.0),
+        ("i2c", {"address": 25, "map": {"registers": [{**SLOW, "period_s": 0.0}]}}, 10.0, 1.0),
+    ],
+)
+def test_a_device_of_slow_inputs_alone_is_given_their_time(kind, parameters, rate_hz, lost_s):
+    launch = DeviceLaunch(name="d", place="m", kind=kind, base_directory="", rate_hz=rate_hz)
+    driven = DrivenDevice.share(launch, prepare(kind, parameters, None))
+    driven.close()
+
+    assert driven.limits.lost_s == pytest.approx(lost_s)

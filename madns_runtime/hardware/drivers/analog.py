@@ -17,6 +17,7 @@ from madns_runtime.hardware.drivers.kernel_files import (
     read_text,
     write_text,
 )
+from madns_runtime.hardware.values import nearest_whole
 
 
 class AnalogDevice(Device):
@@ -31,6 +32,11 @@ class AnalogDevice(Device):
         """
         p = self.parameters
         self._folder = Path(p.root) / p.device
+        self._limits = {
+            each.name: (each.low, each.high)
+            for each in p.inputs
+            if each.low is not None and each.high is not None
+        }
         self._lines = {
             each.name: (
                 self._folder / each.file,
@@ -69,6 +75,10 @@ class AnalogDevice(Device):
             raw = number / scale - offset
             if not math.isfinite(raw):
                 raise PluginError(f"expected a value that the converter can hold, got {number:g}")
+            limits = self._limits.get(name)
+            if limits is not None:
+                first, last = (each / scale - offset for each in limits)
+                raw = nearest_whole(raw, (first, last))
             try:
                 write_text(path, str(round(raw)))
             except ValueRefused as error:

@@ -157,6 +157,7 @@ class GpioDevice(Device):
         )
         if line.mode == "output" and not self.may_move:
             settings.direction = kinds.Direction.AS_IS
+            settings.bias = kinds.Bias.AS_IS  # the kernel takes another one with a direction alone
         elif line.mode == "output":
             settings.direction = kinds.Direction.OUTPUT
             settings.output_value = kinds.Value.ACTIVE if line.safe else kinds.Value.INACTIVE

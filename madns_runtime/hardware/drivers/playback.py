@@ -13,7 +13,7 @@ from typing import Any, Final
 from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel, Sample, SimulatedDevice, Value
 from madns_runtime.hardware.kinds.playback import PlaybackParameters, streams_of
-from madns_runtime.recording.reader import StreamReading, read_stream
+from madns_runtime.recording.reader import StreamReading, StreamState, read_stream
 
 ROUNDING_S: Final = 1e-6
 """Of recorded times and ages together."""
@@ -45,10 +45,18 @@ class PlaybackDevice(SimulatedDevice):
     def _samples_of(
         self, channel: Channel, path: Path, found_at: Callable[[float], float]
     ) -> Iterator[tuple[float, Sample]]:
-        """Yield the samples of one input with their times, and count the lines of its file that were none."""
-        stream = read_stream(path)
-        yield from _samples(channel, stream, self.parameters, found_at)
-        self.count("damaged_lines", stream.state.damaged + stream.state.truncated_lines)
+        """Yield the samples of one input with their times, and count the lines of its file so far that were none."""
+        stream, counted = read_stream(path), 0
+        for found in _samples(channel, stream, self.parameters, found_at):
+            yield found
+            counted += self._count_damaged(stream.passed, counted)  # a run may end before it does
+        self._count_damaged(stream.passed, counted)
+
+    def _count_damaged(self, passed: StreamState, counted: int) -> int:
+        """Count the lines that were none and are not *counted* yet, and return how many they are."""
+        if found := passed.damaged + passed.truncated_lines - counted:
+            self.count("damaged_lines", found)
+        return found
 
     def sample_at(self, t_s: float) -> Sample | None:
         """Return the next sample that was handed on by *t_s*; of outputs alone, which have none on record, that they are there."""

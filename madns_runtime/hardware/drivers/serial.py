@@ -20,6 +20,9 @@ READ_BYTES = 65_536
 
 
 WRITE_TIMEOUT_S = 1.0
+TTY_FOLDER = "/sys/class/tty"
+USB_LEVELS_MAX = 4
+"""From a port's folder up to its adapter's: by the interface, and of some the port, to the USB device."""
 
 
 class SerialDevice(Device):
@@ -174,11 +177,15 @@ def _why_closed(port: str, error: Exception) -> str:
 def _adapter_serial(port: str) -> str:
     """Return the serial number of a USB adapter, as the kernel tells it; empty if there is none."""
     name = os.path.basename(os.path.realpath(port))
-    folder = os.path.realpath(f"/sys/class/tty/{name}/device")
-    for _ in range(4):
+    folder = os.path.realpath(f"{TTY_FOLDER}/{name}/device")
+    for _ in range(USB_LEVELS_MAX):
+        if not os.path.exists(f"{folder}/idVendor"):
+            folder = os.path.dirname(folder)
+            continue
+        # The first USB device on the way up is the adapter; hubs and controllers above it have numbers, too.
         try:
             with open(f"{folder}/serial", encoding="utf-8", errors="replace") as file:
                 return file.read(256).strip()
         except OSError:
-            folder = os.path.dirname(folder)
+            return ""
     return ""

@@ -50,10 +50,13 @@ def channels_of(parameters: SenseHatParameters) -> tuple[Channel, ...]:
         found.append(_vector("gyroscope", "rad/s", math.radians(2000)))
     if parameters.magnetometer:
         found.append(_vector("magnetometer", "T", 16e-4))
+    period_s = parameters.environment_period_s
+    given_hz = 1.0 / period_s if period_s else math.inf
+    slow_hz, fast_hz = min(12.5, given_hz), min(25.0, given_hz)
     found += [
-        Channel(name="temperature", unit="degC", limits=(0.0, 80.0), rate_hz_max=12.5),
-        Channel(name="pressure", unit="hPa", limits=(260.0, 1260.0), rate_hz_max=25.0),
-        Channel(name="humidity", unit="%", limits=(0.0, 100.0), rate_hz_max=12.5),
+        Channel(name="temperature", unit="degC", limits=(0.0, 80.0), rate_hz_max=slow_hz),
+        Channel(name="pressure", unit="hPa", limits=(260.0, 1260.0), rate_hz_max=fast_hz),
+        Channel(name="humidity", unit="%", limits=(0.0, 100.0), rate_hz_max=slow_hz),
     ]
     if parameters.joystick:
         found.append(

@@ -14,7 +14,7 @@ from typing import Any, Final
 from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.contract import Channel, Device, Sample, SimulatedDevice
 from madns_runtime.hardware.kind_registry import DeviceProgram
-from madns_runtime.hardware.status import STALE_PERIODS
+from madns_runtime.hardware.status import STALE_PERIODS, sample_period_s
 from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, to_numbers
 from madns_runtime.hardware.verification.order import (
     MEMORY_BYTES_MAX,
@@ -136,7 +136,8 @@ def take_samples(
     read_s = median(reads_s) if reads_s else math.inf
     keeps_rate = got_hz >= 0.99 * rate_hz * wanted / (wanted + 1) or read_s <= 1.0 / rate_hz
     # In a run a device that gives less often is stale, and lost.
-    is_sparse = fd is None and STALE_PERIODS * count < len(reads_s)
+    reads_each = rate_hz * sample_period_s(rate_hz, program.channels)
+    is_sparse = fd is None and STALE_PERIODS * reads_each * count < len(reads_s)
     of_reads = f": {count} samples in {len(reads_s)} reads" if is_sparse else ""
     told = ", ".join(f"{name} {number} times" for name, number in beyond.items())
     return [
