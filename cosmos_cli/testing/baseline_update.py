@@ -10,7 +10,7 @@ from dataclasses import replace
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.baseline import Baseline, parse_baseline
 from cosmos_cli.models.document import Document, Path, SourcePlace
-from cosmos_cli.models.yaml_source import YamlSource
+from cosmos_cli.models.yaml_source import YamlSource, read_source
 from cosmos_cli.testing.figures import ComparedFigure, FigureValue
 from madns_runtime.partial_file import write_whole
 
@@ -28,7 +28,8 @@ def update_baseline(baseline: Baseline, compared: Sequence[ComparedFigure]) -> i
         How many figures changed.
 
     Raises:
-        InputError: A figure has no value, or cannot be written where it stands; then nothing is.
+        InputError: A figure has no value, cannot be written where it stands, or the file is another than was read;
+            then nothing is.
     """
     missing = [
         baseline.fault(figure.name, figure.why_none) for figure in compared if figure.got is None
@@ -45,6 +46,10 @@ def update_baseline(baseline: Baseline, compared: Sequence[ComparedFigure]) -> i
     text = edited(baseline.document, changed)
     if not _means(baseline, text, changed):
         raise InputError(faults=list(_unwritable(baseline, changed)))
+    if read_source(baseline.path).text != baseline.document.source.text:
+        raise InputError(
+            f"{baseline.path}: was changed while the tests ran; nothing is written: run them again"
+        )
     try:
         # A link to a baseline that is shared stays one.
         write_whole(baseline.path.resolve(), text.encode())

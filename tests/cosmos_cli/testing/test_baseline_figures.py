@@ -306,6 +306,16 @@ def test_a_link_to_a_baseline_stays_a_link(baseline, tmp_path):
     assert "expected: 2" in (tmp_path / "b.yaml").read_text()
 
 
+def test_what_was_written_into_a_baseline_while_the_tests_ran_stays(baseline):
+    found = baseline("figures: {a: {path: x, expected: 1}}")
+    theirs = "figures: {a: {path: x, expected: 1, tolerance: 5}}  # a person's\n"
+    found.path.write_text(theirs)
+
+    with pytest.raises(InputError, match="b.yaml: was changed while the tests ran; nothing is"):
+        update_baseline(found, [ComparedFigure(name="a", expected=1.0, got=2.0)])
+    assert found.path.read_text() == theirs
+
+
 def test_last_value_of_an_agent_is_its_last_that_is_there(baseline, tmp_path):
     """As of a sensor that drops out at the end: a record without a value has none."""
     made = SyntheticRun(tmp_path).write()
