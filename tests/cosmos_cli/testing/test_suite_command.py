@@ -221,6 +221,19 @@ def test_two_tests_do_not_write_one_baseline(cosmos):
     assert "each needs its own" in done.stderr
 
 
+def test_a_baseline_is_not_written_with_the_seed_that_failed_last(cosmos, monkeypatch, capsys):
+    path = scenario(cosmos, "s", baseline="figures.yaml")
+    file = path.with_name("figures.yaml")
+    file.write_text("figures: {a: {path: seed, expected: 0}}\n")
+    monkeypatch.setattr("cosmos_cli.commands.test.read_failed", lambda: ((str(path), 7),))
+    monkeypatch.setenv("COSMOS_RUNS", str(cosmos.runs))
+    code = run_here(["test", str(path), "--last-failed", "--update-baselines"])
+
+    assert code == 2
+    assert "figures of the scenario's own: leave out --last-failed" in capsys.readouterr().err
+    assert file.read_text() == "figures: {a: {path: seed, expected: 0}}\n"
+
+
 def test_a_run_by_itself_writes_junit_xml_too(cosmos):
     path = scenario(cosmos, "s")
     done = cosmos("run", path, "--no-report", "--duration", "1", "--junit", "j.xml")
