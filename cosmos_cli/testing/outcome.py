@@ -72,10 +72,9 @@ def judge_case(
         is_interrupted: Whether somebody stopped the suite, and the run did not come to its end before.
     """
     reasons = _reasons(case, result)
-    is_cut = is_interrupted and result.exit_code == ExitCode.INTERRUPTED
-    killed = is_interrupted and result.exit_code < 0
+    is_cut = result.exit_code == ExitCode.INTERRUPTED or result.exit_code < 0
     outcome: ResultWord = "failed" if reasons else "passed"
-    if is_cut or killed:
+    if is_interrupted and is_cut and not result.is_too_long:  # else its deadline cut it before
         outcome, reasons = "interrupted", []
     verdict = str(result.document.get("verdict") or "")
     return CaseOutcome(

@@ -66,6 +66,14 @@ def test_a_run_that_was_cut_by_ctrl_c_did_not_fail():
     assert judged(result=make_result(-9, document={}), is_interrupted=True).outcome == "interrupted"
 
 
+def test_a_run_beyond_its_deadline_failed_though_ctrl_c_came_while_it_ended():
+    for exit_code in (130, -9):
+        outcome = judged(result=make_result(exit_code, is_too_long=True), is_interrupted=True)
+
+        assert outcome.outcome == "failed"
+        assert outcome.reasons == ("not done after 60 s (its deadline), and ended",)
+
+
 def test_a_figure_out_of_tolerance_fails_and_says_what_was_expected():
     good = ComparedFigure(name="a", expected=1.0, got=1.05, allowed=0.1)
     bad = ComparedFigure(name="b", expected=1.0, got=1.2, allowed=0.1)
