@@ -57,8 +57,8 @@ class ComparedFigure:
             )
         within = f" within {self.allowed:.10g}" if self.allowed else ""
         expected, got = shown(self.expected), shown(self.got)
-        if expected == got and type(self.expected) is type(self.got):  # they differ in later digits
-            expected, got = str(self.expected), str(self.got)
+        if expected == got:  # they differ in later digits, or one is a text
+            expected, got = _exactly(self.expected), _exactly(self.got)
         told = f"{self.name}: expected {expected}{within}, got {got}"
         return f"{told}: {self.why_none}" if self.why_none else told
 
@@ -108,6 +108,13 @@ def compare_figures(
 
 def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _exactly(value: FigureValue) -> str:
+    """Return a value in words that no other has: a number in all its digits, a text in quotes."""
+    return (
+        str(value) if _is_number(value) else repr(value) if isinstance(value, str) else shown(value)
+    )
 
 
 def _at_path(document: Mapping[str, Any], figure: BaselineFigure) -> tuple[FigureValue, str]:

@@ -71,7 +71,7 @@ def test_figures_of_run_json_and_of_streams_are_compared_within_their_tolerance(
         ),
         ("{path: timing.ticks}", "has no expected value: write it with cosmos test"),
         ("{path: timing.ticks, expected: 399}", "expected 399, got 400"),
-        ("{path: timing.ticks, expected: '400'}", "expected 400, got 400"),
+        ("{path: timing.ticks, expected: '400'}", "expected '400', got 400"),
         ("{path: timing.ticks, expected: true}", "expected true, got 400"),
     ],
 )
@@ -220,10 +220,17 @@ def test_what_is_written_has_few_digits_where_the_tolerance_lets_it(baseline, ru
     assert "expected: 0.6666666667, path: y" in found.path.read_text()
 
 
-def test_values_that_differ_in_their_last_digits_alone_are_told_apart():
-    figure = ComparedFigure(name="a", expected=1.0, got=1.0 + 2**-50)
-
-    assert figure.reason() == "a: expected 1.0, got 1.0000000000000009"
+@pytest.mark.parametrize(
+    ("expected", "got", "told"),
+    [
+        (1.0, 1.0 + 2**-50, "expected 1.0, got 1.0000000000000009"),
+        (12345678901.0, 12345678902, "expected 12345678901.0, got 12345678902"),
+        ("true", True, "expected 'true', got true"),
+        (True, "true", "expected true, got 'true'"),
+    ],
+)
+def test_values_that_look_the_same_in_few_digits_are_told_apart(expected, got, told):
+    assert ComparedFigure(name="a", expected=expected, got=got).reason() == f"a: {told}"
 
 
 @pytest.mark.parametrize(("expected", "got"), [(0.8, 0.7), (0.3, 0.4), (1.1, 1.2)])
