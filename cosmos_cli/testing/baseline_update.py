@@ -16,6 +16,7 @@ from madns_runtime.partial_file import write_whole
 
 _LINE_START = re.compile(r"(?<=\n)|(?<=\r)(?!\n)")
 """As lines are counted in places: `str.splitlines` knows further ends."""
+_HALVES = re.compile(r"\\ud[89ab][0-9a-f]{2}\\ud[c-f][0-9a-f]{2}")
 Edit = tuple[int, int, int, str]
 """Line from 0, column from 0, characters that go, and the text that comes."""
 
@@ -79,9 +80,7 @@ def _means(baseline: Baseline, text: str, changed: Mapping[str, FigureValue]) ->
     except InputError:
         return False
     wanted = {
-        name: replace(figure, expected=json.loads(_scalar(changed[name])))
-        if name in changed
-        else figure
+        name: replace(figure, expected=_as_read(changed[name])) if name in changed else figure
         for name, figure in baseline.figures.items()
     }
     return found == wanted
@@ -110,13 +109,25 @@ def _written(figure: ComparedFigure, relative: float) -> FigureValue:
     return short if abs(short - got) <= max(figure.allowed, relative * abs(short)) else got
 
 
+def _as_read(value: FigureValue) -> FigureValue:
+    """Return a value as a baseline has it that is read again: numbers are floats there."""
+    is_whole = isinstance(value, int) and not isinstance(value, bool)
+    return float(_scalar(value)) if is_whole or isinstance(value, float) else value
+
+
 def _scalar(value: FigureValue) -> str:
     if not isinstance(value, float):
-        return json.dumps(value)
+        return _HALVES.sub(_joined, json.dumps(value))
     text = f"{value:.10g}"
     mantissa, mark, power = (text if float(text) == value else repr(value)).partition("e")
     # Readers of YAML 1.1 take 1e-07 for a text.
     return f"{mantissa}{'' if '.' in mantissa or not mark else '.0'}{mark}{power}"
+
+
+def _joined(halves: re.Match[str]) -> str:
+    """Return a letter beyond U+FFFF, of which JSON writes two halves, as one escape: YAML does not join them."""
+    letter = json.loads(f'"{halves[0]}"')
+    return f"\\U{ord(letter):08x}"
 
 
 def _edit(document: Document, lines: Sequence[str], name: str, text: str) -> Edit | None:

@@ -302,6 +302,24 @@ def test_letters_that_other_programs_take_for_line_ends_are_none(baseline):
     assert found.path.read_bytes() == before.replace(b"3.0", b"12.5")
 
 
+@pytest.mark.parametrize(
+    "got",
+    [
+        "\U0001f6f0 of \U0010ffff",
+        "a\\ud83d\\ude00",
+        "\x7f \x1b\x85\u2028\ufeff\ufffe",
+        2**53 + 1,
+        -(2**60) + 1,
+    ],
+)
+def test_any_text_and_whole_number_is_written_and_holds(baseline, got):
+    found = baseline("figures: {a: {path: x, expected: 1}}")
+
+    assert update_baseline(found, [ComparedFigure(name="a", expected=1.0, got=got)]) == 1
+    written = read_baseline(found.path).figures["a"].expected
+    assert ComparedFigure(name="a", expected=written, got=got).passed
+
+
 def test_a_link_to_a_baseline_stays_a_link(baseline, tmp_path):
     baseline("figures: {a: {path: x, expected: 1}}")
     link = tmp_path / "link.yaml"
