@@ -4,6 +4,7 @@ import pytest
 from suite_cases import broken, make_case, make_result
 
 from cosmos_cli.models.scenario_test import ExpectedOutcome
+from cosmos_cli.testing.check_lines import check_line
 from cosmos_cli.testing.figures import ComparedFigure
 from cosmos_cli.testing.outcome import judge_case, with_figures
 from cosmos_cli.testing.terminal import details
@@ -52,6 +53,12 @@ def test_a_failure_names_checks_worst_agent_run_and_the_command_that_repeats_it(
     assert "repeat it: cosmos run ring.yaml --set time.duration_s=20 --set seed=3" in told
     assert "its run: /my runs/tests/0001-ring" in told
     assert "its figures: cosmos report '/my runs/tests/0001-ring'" in told
+
+
+def test_a_check_that_is_broken_by_its_later_digits_is_told_with_them():
+    lines = [check_line(broken("a", limit=200, got=got)) for got in (200 + 2**-40, 200.0)]
+
+    assert lines == ["a: got 200.0000000000009, limit 200", "a: got 200, limit 200"]
 
 
 def test_the_scenarios_own_seed_is_in_the_command_that_repeats_it():
