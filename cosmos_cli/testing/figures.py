@@ -10,6 +10,7 @@ from typing import Any, TypeGuard, cast
 
 import numpy as np
 
+from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.evidence.tables import TableReader, open_tables
@@ -147,7 +148,10 @@ def _of_stream(
     sources = _named(table.sources, meant)
     if not sources and not (figure.statistic == "count" and _named(agents, meant)):
         return None, f"nobody of {', '.join(figure.agents)} recorded {figure.stream}"
-    return _statistic(figure, table, sources)
+    try:
+        return _statistic(figure, table, sources)
+    except InputError as error:  # its table is damaged: the other tests go on
+        return None, str(error)
 
 
 def _named(names: Iterable[str], patterns: Collection[str]) -> list[str]:

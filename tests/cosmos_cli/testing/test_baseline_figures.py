@@ -125,6 +125,20 @@ def test_records_are_counted_by_a_field_of_any_kind_that_they_have(baseline, tmp
     assert {each.name: each.got for each in compared} == dict.fromkeys(kinds, 2)
 
 
+def test_a_table_that_is_damaged_gives_no_figure_and_ends_no_suite(baseline, tmp_path):
+    made = SyntheticRun(tmp_path / "runs").write()
+    gather(made.run, 10.0, lambda *told: None)
+    table = made.run.tables / "round_trips.parquet"
+    data = table.read_bytes()
+    table.write_bytes(data[:200] + bytes(400) + data[600:])
+    found = baseline("figures: {a: {stream: round_trips, field: packet, statistic: mean}}")
+
+    (compared,) = compare_figures(found, made.run, {})
+
+    assert compared.got is None
+    assert "round_trips.parquet: damaged" in compared.reason()
+
+
 def test_no_record_of_an_agent_that_there_is_counts_as_0_and_has_no_other_figure(
     baseline, tmp_path
 ):
