@@ -136,10 +136,12 @@ def test(
     result = _run(console, chosen.cases, options)
     seconds = time.monotonic() - started_s
     remember_failed(result.outcomes)
-    if junit is not None:
-        cases = list(junit_cases(result.outcomes, chosen.cases))
-        write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
-    _tell(console, result, chosen, seconds)
+    try:
+        if junit is not None:
+            cases = list(junit_cases(result.outcomes, chosen.cases))
+            write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
+    finally:  # a disk that is full by now takes no file, and what failed is told all the same
+        _tell(console, result, chosen, seconds)
     return int(result.exit_code)
 
 
