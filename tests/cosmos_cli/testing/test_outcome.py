@@ -73,6 +73,16 @@ def test_a_run_that_was_cut_by_ctrl_c_did_not_fail():
     assert judged(result=make_result(-9, document={}), is_interrupted=True).outcome == "interrupted"
 
 
+def test_a_run_that_ctrl_c_met_as_python_began_did_not_fail():
+    words = 'Traceback (most recent call last):\n  File "<frozen site>"\nKeyboardInterrupt'
+    cut = make_result(1, document={}, words=words)
+
+    assert judged(result=cut, is_interrupted=True).outcome == "interrupted"
+    assert judged(result=cut).outcome == "failed"
+    crashed = make_result(1, document={}, words="ValueError: x")
+    assert judged(result=crashed, is_interrupted=True).outcome == "failed"
+
+
 def test_a_run_beyond_its_deadline_failed_though_ctrl_c_came_while_it_ended():
     for exit_code in (130, -9):
         outcome = judged(result=make_result(exit_code, is_too_long=True), is_interrupted=True)
