@@ -17,6 +17,7 @@ from madns_runtime.partial_file import write_whole
 _LINE_START = re.compile(r"(?<=\n)|(?<=\r)(?!\n)")
 """As lines are counted in places: `str.splitlines` knows further ends."""
 _HALVES = re.compile(r"\\ud[89ab][0-9a-f]{2}\\ud[c-f][0-9a-f]{2}")
+_QUOTED = re.compile(r"'(?:[^']|'')*'" r'|"(?:[^"\\]|\\.)*"')
 Edit = tuple[int, int, int, str]
 """Line from 0, column from 0, characters that go, and the text that comes."""
 
@@ -166,8 +167,5 @@ def _length(document: Document, path: Path, rest: str) -> int:
     """Return the characters of a scalar: a plain one as it is written, a quoted one to its closing mark."""
     if path in document.texts:
         return len(document.texts[path])
-    mark = rest[:1]
-    index = 1
-    while index < len(rest) and rest[index] != mark:
-        index += 2 if mark == '"' and rest[index] == "\\" else 1
-    return index + 1
+    quoted = _QUOTED.match(rest)
+    return len(rest) if quoted is None else quoted.end()

@@ -334,6 +334,16 @@ def test_any_text_and_whole_number_is_written_and_holds(baseline, got):
     assert ComparedFigure(name="a", expected=written, got=got).passed
 
 
+@pytest.mark.parametrize("old", ["'it''s'", "''", "''''", '"a \\" b"', '""', r"'a\'"])
+def test_a_quoted_text_is_replaced_in_whole(baseline, old):
+    found = baseline(f"figures: {{a: {{path: x, expected: {old}, tolerance: 0}}}}  # it's\n")
+
+    update_baseline(found, [ComparedFigure(name="a", expected="it", got="new")])
+    assert found.path.read_text() == (
+        'figures: {a: {path: x, expected: "new", tolerance: 0}}  # it\'s\n'
+    )
+
+
 def test_a_link_to_a_baseline_stays_a_link(baseline, tmp_path):
     baseline("figures: {a: {path: x, expected: 1}}")
     link = tmp_path / "link.yaml"
