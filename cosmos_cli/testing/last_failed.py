@@ -29,7 +29,7 @@ def read_failed() -> tuple[FailedTest, ...]:
     try:
         listed = json.loads(read_own_file(memory_file(), bytes_max=FILE_BYTES_MAX))
         return tuple((str(path), None if seed is None else int(seed)) for path, seed in listed)
-    except (OSError, ValueError, TypeError, RecursionError):
+    except (OSError, ValueError, TypeError, OverflowError, RecursionError):
         return ()
 
 
