@@ -103,15 +103,17 @@ def _run(console: Console, checked: ScenarioFile, options: RunOptions, junit: Pa
     if isinstance(summary, Detached):
         console.print_json(summary.to_mapping())
         return say(summary.words)
-    if junit is not None:
-        case = junit_case_of(checked.path, summary.run.path, summary.document)
-        seconds = time.monotonic() - started_s
-        write_junit(
-            junit, [replace(case, seconds=seconds)], seconds=seconds, started_utc=started_utc
-        )
-    with losing_output(f"{summary.verdict.text}; it stands in {summary.run.run_json}"):
-        console.print_json(dict(summary.document))
-        say(summary.last_line)
+    try:
+        if junit is not None:
+            case = junit_case_of(checked.path, summary.run.path, summary.document)
+            seconds = time.monotonic() - started_s
+            write_junit(
+                junit, [replace(case, seconds=seconds)], seconds=seconds, started_utc=started_utc
+            )
+    finally:  # a disk that is full by now takes no file, and the verdict is told all the same
+        with losing_output(f"{summary.verdict.text}; it stands in {summary.run.run_json}"):
+            console.print_json(dict(summary.document))
+            say(summary.last_line)
     raise typer.Exit(int(summary.exit_code))
 
 

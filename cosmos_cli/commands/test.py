@@ -136,10 +136,12 @@ def test(
     result = _run(console, chosen.cases, options)
     seconds = time.monotonic() - started_s
     remember_failed(result.outcomes)
-    if junit is not None:
-        cases = list(junit_cases(result.outcomes, chosen.cases))
-        write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
-    _tell(console, result, chosen, seconds)
+    try:
+        if junit is not None:
+            cases = list(junit_cases(result.outcomes, chosen.cases))
+            write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
+    finally:  # a disk that is full by now takes no file, and what failed is told all the same
+        _tell(console, result, chosen, seconds)
     return int(result.exit_code)
 
 
@@ -223,7 +225,7 @@ def _chosen(
 
 def _check_owners(cases: Sequence[SuiteCase]) -> None:
     """
-    Refuse a baseline that two tests would write.
+    Refuse a baseline that two tests would write, or one with another seed than its scenario's.
 
     Raises:
         InputError: There is one.
@@ -232,6 +234,11 @@ def _check_owners(cases: Sequence[SuiteCase]) -> None:
     for case in cases:
         if case.baseline is None:
             continue
+        if case.has_given_seed:
+            raise InputError(
+                f"{case.name}: failed last time with a seed of --seeds, and --update-baselines writes"
+                " figures of the scenario's own: leave out --last-failed"
+            )
         other = owners.setdefault(real_path(case.baseline.path), case)
         if other is not case:
             text = f"is the baseline of {other.name} and of {case.name}: each needs its own"

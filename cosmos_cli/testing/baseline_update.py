@@ -10,12 +10,14 @@ from dataclasses import replace
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.baseline import Baseline, parse_baseline
 from cosmos_cli.models.document import Document, Path, SourcePlace
-from cosmos_cli.models.yaml_source import YamlSource
+from cosmos_cli.models.yaml_source import YamlSource, read_source
 from cosmos_cli.testing.figures import ComparedFigure, FigureValue
 from madns_runtime.partial_file import write_whole
 
 _LINE_START = re.compile(r"(?<=\n)|(?<=\r)(?!\n)")
 """As lines are counted in places: `str.splitlines` knows further ends."""
+_HALVES = re.compile(r"\\ud[89ab][0-9a-f]{2}\\ud[c-f][0-9a-f]{2}")
+_QUOTED = re.compile(r"'(?:[^']|'')*'" r'|"(?:[^"\\]|\\.)*"')
 Edit = tuple[int, int, int, str]
 """Line from 0, column from 0, characters that go, and the text that comes."""
 
@@ -28,7 +30,8 @@ def update_baseline(baseline: Baseline, compared: Sequence[ComparedFigure]) -> i
         How many figures changed.
 
     Raises:
-        InputError: A figure has no value, or cannot be written where it stands; then nothing is.
+        InputError: A figure has no value, cannot be written where it stands, or the file is another than was read;
+            then nothing is.
     """
     missing = [
         baseline.fault(figure.name, figure.why_none) for figure in compared if figure.got is None
@@ -45,6 +48,10 @@ def update_baseline(baseline: Baseline, compared: Sequence[ComparedFigure]) -> i
     text = edited(baseline.document, changed)
     if not _means(baseline, text, changed):
         raise InputError(faults=list(_unwritable(baseline, changed)))
+    if read_source(baseline.path).text != baseline.document.source.text:
+        raise InputError(
+            f"{baseline.path}: was changed while the tests ran; nothing is written: run them again"
+        )
     try:
         # A link to a baseline that is shared stays one.
         write_whole(baseline.path.resolve(), text.encode())
@@ -74,9 +81,7 @@ def _means(baseline: Baseline, text: str, changed: Mapping[str, FigureValue]) ->
     except InputError:
         return False
     wanted = {
-        name: replace(figure, expected=json.loads(_scalar(changed[name])))
-        if name in changed
-        else figure
+        name: replace(figure, expected=_as_read(changed[name])) if name in changed else figure
         for name, figure in baseline.figures.items()
     }
     return found == wanted
@@ -105,13 +110,25 @@ def _written(figure: ComparedFigure, relative: float) -> FigureValue:
     return short if abs(short - got) <= max(figure.allowed, relative * abs(short)) else got
 
 
+def _as_read(value: FigureValue) -> FigureValue:
+    """Return a value as a baseline has it that is read again: numbers are floats there."""
+    is_whole = isinstance(value, int) and not isinstance(value, bool)
+    return float(_scalar(value)) if is_whole or isinstance(value, float) else value
+
+
 def _scalar(value: FigureValue) -> str:
     if not isinstance(value, float):
-        return json.dumps(value)
+        return _HALVES.sub(_joined, json.dumps(value))
     text = f"{value:.10g}"
     mantissa, mark, power = (text if float(text) == value else repr(value)).partition("e")
     # Readers of YAML 1.1 take 1e-07 for a text.
     return f"{mantissa}{'' if '.' in mantissa or not mark else '.0'}{mark}{power}"
+
+
+def _joined(halves: re.Match[str]) -> str:
+    """Return a letter beyond U+FFFF, of which JSON writes two halves, as one escape: YAML does not join them."""
+    letter = json.loads(f'"{halves[0]}"')
+    return f"\\U{ord(letter):08x}"
 
 
 def _edit(document: Document, lines: Sequence[str], name: str, text: str) -> Edit | None:
@@ -150,8 +167,5 @@ def _length(document: Document, path: Path, rest: str) -> int:
     """Return the characters of a scalar: a plain one as it is written, a quoted one to its closing mark."""
     if path in document.texts:
         return len(document.texts[path])
-    mark = rest[:1]
-    index = 1
-    while index < len(rest) and rest[index] != mark:
-        index += 2 if mark == '"' and rest[index] == "\\" else 1
-    return index + 1
+    quoted = _QUOTED.match(rest)
+    return len(rest) if quoted is None else quoted.end()

@@ -16,11 +16,14 @@ def broken_checks(document: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 def check_line(check: Mapping[str, Any]) -> str:
     """Return a broken check in words: name, what came, the limit, the worst agent and when."""
     unit = f" {check['unit']}" if check.get("unit") else ""
-    got = "not measured" if check.get("got") is None else f"{shown(check['got'])}{unit}"
+    value, limit = check.get("got"), check.get("limit")
+    is_told_apart = shown(value) != shown(limit) or value == limit
+    words = shown(value) if is_told_apart else str(value)  # broken by its later digits
+    got = "not measured" if value is None else f"{words}{unit}"
     whose = check.get("agent") or check.get("worst")
     at = f" at {shown(check['t_s'])} s" if check.get("t_s") is not None else ""
     who = f", worst: {whose}{at}" if whose else at
-    return f"{check.get('name')}: got {got}, limit {shown(check.get('limit'))}{unit}{who}"
+    return f"{check.get('name')}: got {got}, limit {shown(limit)}{unit}{who}"
 
 
 def shown(value: object) -> str:

@@ -46,7 +46,7 @@ def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
     begins with a dot, runs, virtual environments, caches) and links to folders.
 
     Raises:
-        InputError: A path is missing, or the folders hold too many files.
+        InputError: A path is missing, a folder cannot be read, or the folders hold too many files.
     """
     found = FoundScenarios()
     missing = [path for path in paths if not os.path.exists(path)]
@@ -71,7 +71,7 @@ def _all_below(folder: Path) -> list[tuple[Path, bool]]:
 
 def _files_below(folder: Path) -> list[tuple[Path, bool]]:
     files: list[tuple[Path, bool]] = []
-    for here, folders, names in os.walk(folder):
+    for here, folders, names in os.walk(folder, onerror=_refuse):
         folders[:] = sorted(
             name
             for name in folders
@@ -83,6 +83,13 @@ def _files_below(folder: Path) -> list[tuple[Path, bool]]:
                 f"{folder}: expected at most {FILES_MAX} YAML files; name folders of it"
             )
     return files
+
+
+def _refuse(error: OSError) -> None:
+    if isinstance(error, FileNotFoundError):  # removed meanwhile, as runs are
+        return
+    text = f"{error.filename}: cannot be read: {error.strerror}; name the folders that are meant"
+    raise InputError(text) from error
 
 
 def _add(found: FoundScenarios, file: Path, *, is_named: bool) -> None:

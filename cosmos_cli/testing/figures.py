@@ -10,6 +10,7 @@ from typing import Any, TypeGuard, cast
 
 import numpy as np
 
+from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.evidence.tables import TableReader, open_tables
@@ -57,8 +58,8 @@ class ComparedFigure:
             )
         within = f" within {self.allowed:.10g}" if self.allowed else ""
         expected, got = shown(self.expected), shown(self.got)
-        if expected == got and type(self.expected) is type(self.got):  # they differ in later digits
-            expected, got = str(self.expected), str(self.got)
+        if expected == got:  # they differ in later digits, or one is a text
+            expected, got = _exactly(self.expected), _exactly(self.got)
         told = f"{self.name}: expected {expected}{within}, got {got}"
         return f"{told}: {self.why_none}" if self.why_none else told
 
@@ -110,6 +111,13 @@ def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
+def _exactly(value: FigureValue) -> str:
+    """Return a value in words that no other has: a number in all its digits, a text in quotes."""
+    return (
+        str(value) if _is_number(value) else repr(value) if isinstance(value, str) else shown(value)
+    )
+
+
 def _at_path(document: Mapping[str, Any], figure: BaselineFigure) -> tuple[FigureValue, str]:
     path, value = figure.path, cast("Any", document)
     for step in figure.path_steps:
@@ -140,7 +148,10 @@ def _of_stream(
     sources = _named(table.sources, meant)
     if not sources and not (figure.statistic == "count" and _named(agents, meant)):
         return None, f"nobody of {', '.join(figure.agents)} recorded {figure.stream}"
-    return _statistic(figure, table, sources)
+    try:
+        return _statistic(figure, table, sources)
+    except InputError as error:  # its table is damaged: the other tests go on
+        return None, str(error)
 
 
 def _named(names: Iterable[str], patterns: Collection[str]) -> list[str]:

@@ -93,9 +93,9 @@ def _add(suite: ElementTree.Element, case: JunitCase) -> None:
     if case.properties:
         listed = ElementTree.SubElement(element, "properties")
         for name, value in case.properties:
-            ElementTree.SubElement(
-                listed, "property", {"name": clean_line(name), "value": clean_line(value)}
-            )
+            # A command with many settings is long, and no use when it is cut.
+            told = clean_line(value, length_max=TEXT_CHARACTERS_MAX)
+            ElementTree.SubElement(listed, "property", {"name": clean_line(name), "value": told})
     if case.failure:
         message = clean_line(case.failure, length_max=MESSAGE_CHARACTERS_MAX)
         failure = ElementTree.SubElement(element, "failure", {"message": message})

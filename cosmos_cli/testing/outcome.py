@@ -72,10 +72,9 @@ def judge_case(
         is_interrupted: Whether somebody stopped the suite, and the run did not come to its end before.
     """
     reasons = _reasons(case, result)
-    is_cut = is_interrupted and result.exit_code == ExitCode.INTERRUPTED
-    killed = is_interrupted and result.exit_code < 0
     outcome: ResultWord = "failed" if reasons else "passed"
-    if is_cut or killed:
+    # Of one that is too long its deadline was before.
+    if is_interrupted and _is_cut(result) and not result.is_too_long:
         outcome, reasons = "interrupted", []
     verdict = str(result.document.get("verdict") or "")
     return CaseOutcome(
@@ -89,6 +88,12 @@ def judge_case(
         words="" if verdict else "\n".join(result.words.splitlines()[-WORDS_LINES_MAX:]),
         directory=str(result.directory or ""),
     )
+
+
+def _is_cut(result: ProcessResult) -> bool:
+    """Tell whether a signal ended a run: as Python began, it says so itself, and ends as any program that crashed."""
+    is_early = not result.document and result.words.endswith(KeyboardInterrupt.__name__)
+    return result.exit_code == ExitCode.INTERRUPTED or result.exit_code < 0 or is_early
 
 
 def with_figures(

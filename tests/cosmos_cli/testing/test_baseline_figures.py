@@ -71,7 +71,7 @@ def test_figures_of_run_json_and_of_streams_are_compared_within_their_tolerance(
         ),
         ("{path: timing.ticks}", "has no expected value: write it with cosmos test"),
         ("{path: timing.ticks, expected: 399}", "expected 399, got 400"),
-        ("{path: timing.ticks, expected: '400'}", "expected 400, got 400"),
+        ("{path: timing.ticks, expected: '400'}", "expected '400', got 400"),
         ("{path: timing.ticks, expected: true}", "expected true, got 400"),
     ],
 )
@@ -123,6 +123,20 @@ def test_records_are_counted_by_a_field_of_any_kind_that_they_have(baseline, tmp
     compared = compare_figures(baseline(f"figures:\n{text}"), made.run, {})
 
     assert {each.name: each.got for each in compared} == dict.fromkeys(kinds, 2)
+
+
+def test_a_table_that_is_damaged_gives_no_figure_and_ends_no_suite(baseline, tmp_path):
+    made = SyntheticRun(tmp_path / "runs").write()
+    gather(made.run, 10.0, lambda *told: None)
+    table = made.run.tables / "round_trips.parquet"
+    data = table.read_bytes()
+    table.write_bytes(data[:200] + bytes(400) + data[600:])
+    found = baseline("figures: {a: {stream: round_trips, field: packet, statistic: mean}}")
+
+    (compared,) = compare_figures(found, made.run, {})
+
+    assert compared.got is None
+    assert "round_trips.parquet: damaged" in compared.reason()
 
 
 def test_no_record_of_an_agent_that_there_is_counts_as_0_and_has_no_other_figure(
@@ -220,10 +234,17 @@ def test_what_is_written_has_few_digits_where_the_tolerance_lets_it(baseline, ru
     assert "expected: 0.6666666667, path: y" in found.path.read_text()
 
 
-def test_values_that_differ_in_their_last_digits_alone_are_told_apart():
-    figure = ComparedFigure(name="a", expected=1.0, got=1.0 + 2**-50)
-
-    assert figure.reason() == "a: expected 1.0, got 1.0000000000000009"
+@pytest.mark.parametrize(
+    ("expected", "got", "told"),
+    [
+        (1.0, 1.0 + 2**-50, "expected 1.0, got 1.0000000000000009"),
+        (12345678901.0, 12345678902, "expected 12345678901.0, got 12345678902"),
+        ("true", True, "expected 'true', got true"),
+        (True, "true", "expected true, got 'true'"),
+    ],
+)
+def test_values_that_look_the_same_in_few_digits_are_told_apart(expected, got, told):
+    assert ComparedFigure(name="a", expected=expected, got=got).reason() == f"a: {told}"
 
 
 @pytest.mark.parametrize(("expected", "got"), [(0.8, 0.7), (0.3, 0.4), (1.1, 1.2)])
@@ -295,6 +316,34 @@ def test_letters_that_other_programs_take_for_line_ends_are_none(baseline):
     assert found.path.read_bytes() == before.replace(b"3.0", b"12.5")
 
 
+@pytest.mark.parametrize(
+    "got",
+    [
+        "\U0001f6f0 of \U0010ffff",
+        "a\\ud83d\\ude00",
+        "\x7f \x1b\x85\u2028\ufeff\ufffe",
+        2**53 + 1,
+        -(2**60) + 1,
+    ],
+)
+def test_any_text_and_whole_number_is_written_and_holds(baseline, got):
+    found = baseline("figures: {a: {path: x, expected: 1}}")
+
+    assert update_baseline(found, [ComparedFigure(name="a", expected=1.0, got=got)]) == 1
+    written = read_baseline(found.path).figures["a"].expected
+    assert ComparedFigure(name="a", expected=written, got=got).passed
+
+
+@pytest.mark.parametrize("old", ["'it''s'", "''", "''''", '"a \\" b"', '""', r"'a\'"])
+def test_a_quoted_text_is_replaced_in_whole(baseline, old):
+    found = baseline(f"figures: {{a: {{path: x, expected: {old}, tolerance: 0}}}}  # it's\n")
+
+    update_baseline(found, [ComparedFigure(name="a", expected="it", got="new")])
+    assert found.path.read_text() == (
+        'figures: {a: {path: x, expected: "new", tolerance: 0}}  # it\'s\n'
+    )
+
+
 def test_a_link_to_a_baseline_stays_a_link(baseline, tmp_path):
     baseline("figures: {a: {path: x, expected: 1}}")
     link = tmp_path / "link.yaml"
@@ -304,6 +353,16 @@ def test_a_link_to_a_baseline_stays_a_link(baseline, tmp_path):
 
     assert link.is_symlink()
     assert "expected: 2" in (tmp_path / "b.yaml").read_text()
+
+
+def test_what_was_written_into_a_baseline_while_the_tests_ran_stays(baseline):
+    found = baseline("figures: {a: {path: x, expected: 1}}")
+    theirs = "figures: {a: {path: x, expected: 1, tolerance: 5}}  # a person's\n"
+    found.path.write_text(theirs)
+
+    with pytest.raises(InputError, match="b.yaml: was changed while the tests ran; nothing is"):
+        update_baseline(found, [ComparedFigure(name="a", expected=1.0, got=2.0)])
+    assert found.path.read_text() == theirs
 
 
 def test_last_value_of_an_agent_is_its_last_that_is_there(baseline, tmp_path):

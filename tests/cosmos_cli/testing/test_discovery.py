@@ -1,5 +1,8 @@
 """Scenarios in files and folders, and the tests that are made of those that are meant."""
 
+import errno
+import os
+
 import pytest
 from harness.nested_folders import nested_folders
 
@@ -107,6 +110,21 @@ def test_folders_that_nest_too_deeply_are_told(folder):
         nested_folders(folder, "a", 1200),
         pytest.raises(InputError, match=f"{folder}: folders nest too deeply there"),
     ):
+        find_scenarios([folder])
+
+
+def test_a_folder_that_may_not_be_read_is_told(folder, monkeypatch):
+    """Its tests would be left out of a suite that passes."""
+    scandir = os.scandir
+
+    def denied(path):
+        if os.fspath(path) == str(folder / "deep"):
+            raise PermissionError(errno.EACCES, "Permission denied", os.fspath(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", denied)
+
+    with pytest.raises(InputError, match="deep: cannot be read: Permission denied"):
         find_scenarios([folder])
 
 

@@ -72,6 +72,13 @@ def test_of_a_megabyte_the_end_is_counted():
     assert "characters more" in failure.text and "characters more" in failure.get("message")
 
 
+def test_a_command_of_many_settings_stands_there_in_whole():
+    command = "cosmos run s.yaml" + "".join(f" --set vars.number_{n}={n}" for n in range(100))
+
+    (listed,) = parsed(case(properties=(("repeat", command),))).iter("property")
+    assert listed.get("value") == command
+
+
 def test_of_no_test_it_is_valid_too():
     assert parsed()[0].get("tests") == "0"
 

@@ -4,6 +4,7 @@ import pytest
 from suite_cases import broken, make_case, make_result
 
 from cosmos_cli.models.scenario_test import ExpectedOutcome
+from cosmos_cli.testing.check_lines import check_line
 from cosmos_cli.testing.figures import ComparedFigure
 from cosmos_cli.testing.outcome import judge_case, with_figures
 from cosmos_cli.testing.terminal import details
@@ -54,6 +55,12 @@ def test_a_failure_names_checks_worst_agent_run_and_the_command_that_repeats_it(
     assert "its figures: cosmos report '/my runs/tests/0001-ring'" in told
 
 
+def test_a_check_that_is_broken_by_its_later_digits_is_told_with_them():
+    lines = [check_line(broken("a", limit=200, got=got)) for got in (200 + 2**-40, 200.0)]
+
+    assert lines == ["a: got 200.0000000000009, limit 200", "a: got 200, limit 200"]
+
+
 def test_the_scenarios_own_seed_is_in_the_command_that_repeats_it():
     assert make_case(seed=11).repeat_command == "cosmos run s.yaml --set seed=11"
 
@@ -64,6 +71,24 @@ def test_a_run_that_was_cut_by_ctrl_c_did_not_fail():
     assert judged(result=cut).outcome == "failed"  # somebody ended that run alone
     assert judged(result=make_result(0), is_interrupted=True).outcome == "passed"
     assert judged(result=make_result(-9, document={}), is_interrupted=True).outcome == "interrupted"
+
+
+def test_a_run_that_ctrl_c_met_as_python_began_did_not_fail():
+    words = 'Traceback (most recent call last):\n  File "<frozen site>"\nKeyboardInterrupt'
+    cut = make_result(1, document={}, words=words)
+
+    assert judged(result=cut, is_interrupted=True).outcome == "interrupted"
+    assert judged(result=cut).outcome == "failed"
+    crashed = make_result(1, document={}, words="ValueError: x")
+    assert judged(result=crashed, is_interrupted=True).outcome == "failed"
+
+
+def test_a_run_beyond_its_deadline_failed_though_ctrl_c_came_while_it_ended():
+    for exit_code in (130, -9):
+        outcome = judged(result=make_result(exit_code, is_too_long=True), is_interrupted=True)
+
+        assert outcome.outcome == "failed"
+        assert outcome.reasons == ("not done after 60 s (its deadline), and ended",)
 
 
 def test_a_figure_out_of_tolerance_fails_and_says_what_was_expected():

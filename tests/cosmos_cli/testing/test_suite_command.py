@@ -5,14 +5,18 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
 from harness.cosmos_command import CosmosCommand
 from harness.waiting import wait_until
 from lxml import etree
+from suite_cases import make_result
 
 from cosmos_cli.app import run as run_here
+from cosmos_cli.testing.outcome import judge_case
+from cosmos_cli.testing.suite import SuiteResult
 from madns_runtime.processes import list_processes
 
 pytestmark = pytest.mark.process
@@ -219,6 +223,66 @@ def test_two_tests_do_not_write_one_baseline(cosmos):
 
     assert done.returncode == 2
     assert "each needs its own" in done.stderr
+
+
+def test_a_baseline_is_not_written_with_the_seed_that_failed_last(cosmos, monkeypatch, capsys):
+    path = scenario(cosmos, "s", baseline="figures.yaml")
+    file = path.with_name("figures.yaml")
+    file.write_text("figures: {a: {path: seed, expected: 0}}\n")
+    monkeypatch.setattr("cosmos_cli.commands.test.read_failed", lambda: ((str(path), 7),))
+    monkeypatch.setenv("COSMOS_RUNS", str(cosmos.runs))
+    code = run_here(["test", str(path), "--last-failed", "--update-baselines"])
+
+    assert code == 2
+    assert "figures of the scenario's own: leave out --last-failed" in capsys.readouterr().err
+    assert file.read_text() == "figures: {a: {path: seed, expected: 0}}\n"
+
+
+def test_what_failed_is_told_though_junit_xml_cannot_be_written_at_the_end(
+    cosmos, monkeypatch, capsys
+):
+    path = scenario(cosmos, "s")
+
+    def fail_all(cases, options, tell):
+        """Let every test fail, and the folder of the results go."""
+        (cosmos.folder / "out").rmdir()
+        (cosmos.folder / "out").touch()
+        failed = [judge_case(case, make_result(4), is_interrupted=False) for case in cases]
+        return SuiteResult(outcomes=failed)
+
+    monkeypatch.setattr("cosmos_cli.commands.test.run_cases", fail_all)
+    monkeypatch.setattr("cosmos_cli.commands.test.remember_failed", list)
+    monkeypatch.setenv("COSMOS_RUNS", str(cosmos.runs))
+    code, said = (
+        run_here(["test", str(path), "--junit", str(cosmos.folder / "out/j.xml")]),
+        capsys.readouterr(),
+    )
+
+    assert code == 2
+    assert "out/j.xml: cannot be written: " in said.err
+    assert "repeat it: cosmos run" in said.out
+    assert "1 failed in" in said.out
+
+
+def test_the_verdict_of_a_run_is_told_though_junit_xml_cannot_be_written_at_the_end(
+    cosmos, monkeypatch, capsys
+):
+    path = scenario(cosmos, "s")
+
+    def end_without_folder(*about):
+        """Return a run that has ended, and let the folder of its results go."""
+        (cosmos.folder / "out").rmdir()
+        (cosmos.folder / "out").touch()
+        run = SimpleNamespace(path=Path("r"), run_json=Path("r/run.json"))
+        return SimpleNamespace(
+            run=run, document={}, verdict=SimpleNamespace(text=""), last_line="CHECK BROKEN: x"
+        )
+
+    monkeypatch.setattr("cosmos_cli.commands.run.execute", end_without_folder)
+    code = run_here(["run", str(path), "--junit", str(cosmos.folder / "out/j.xml")])
+
+    assert code == 2
+    assert capsys.readouterr().out == "CHECK BROKEN: x\n"
 
 
 def test_a_run_by_itself_writes_junit_xml_too(cosmos):
