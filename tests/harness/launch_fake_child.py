@@ -8,6 +8,7 @@ agent_killed_on): what must have happened by then takes as long as it takes.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -29,7 +30,8 @@ class Line:
 
     def say(self, event: str, **values: object) -> None:
         data = json.dumps({"event": event, **values}).encode() + b"\n"
-        os.write(self.write_fd, data)
+        with contextlib.suppress(BrokenPipeError):  # an operator that is gone is noticed where its commands are read
+            os.write(self.write_fd, data)
 
     def commands(self, timeout_s: float) -> list[dict]:
         if not select.select([self.read_fd], [], [], timeout_s)[0]:
