@@ -30,7 +30,7 @@ class Line:
 
     def say(self, event: str, **values: object) -> None:
         data = json.dumps({"event": event, **values}).encode() + b"\n"
-        with contextlib.suppress(BrokenPipeError):  # an operator that is gone is noticed where its commands are read
+        with contextlib.suppress(BrokenPipeError):  # `commands` notices that the operator is gone
             os.write(self.write_fd, data)
 
     def commands(self, timeout_s: float) -> list[dict]:
