@@ -2,8 +2,10 @@
 Commands forked from a process that has imported `cosmos` already, for tests that start hundreds of them.
 
 Imports are two thirds of what a short command computes. Each command is a process of its own all the same, with its own
-environment, folder, standard streams and exit code, and goes the whole way through `cosmos_cli.start`. Tests of faults and
-of fleets start theirs from nothing, and so do those that change how Python itself starts.
+environment, folder, standard streams and exit code, and goes the whole way through `cosmos_cli.start`. Tests of faults start
+theirs from nothing, and so do those that change how Python itself starts, or look at a command's environment from outside.
+
+No library that is imported has a thread but pyarrow, whose allocator (jemalloc) makes its own anew in a forked process.
 """
 
 import array
