@@ -45,10 +45,12 @@ def test_the_event_of_a_loss_on_purpose_says_so_as_in_lockstep(
     intended = IntendedLosses()
     if is_ordered:
         intended.order("a", WHY, returns_s=None)
+    host: Any = SimpleNamespace()
+    faults: Any = SimpleNamespace(intended=intended)
     losses = AgentLosses(
         core,
-        SimpleNamespace(),  # type: ignore[arg-type]
-        faults=SimpleNamespace(intended=intended),  # type: ignore[arg-type]
+        host,
+        faults=faults,
         announced=Announcements(journal, lambda event: None),
         call=print,
     )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 import pytest
@@ -44,7 +45,7 @@ class PlayedBoard:
     """Answers as told; what it was asked is in `asked`."""
 
     living: Sequence[dict[str, str]] = ()
-    greeting: dict[str, int] = {"uid": 1000}  # noqa: RUF012 - replaced, never changed
+    greeting: Mapping[str, int] = MappingProxyType({"uid": 1000})
     failures: dict[str, MachineFailure]
     asked: list[str]
 
@@ -84,7 +85,7 @@ def board(monkeypatch: pytest.MonkeyPatch) -> type[PlayedBoard]:
     return played
 
 
-def rebooting(*tries: str | MachineFailure, **more: Any) -> Rebooting:
+def rebooting(*tries: str | MachineFailure, **more: Any) -> Any:
     """Connections after the order find these boots, or fail so; the last one for ever."""
     left: Iterator[str | MachineFailure] = iter(tries)
     last: list[str | MachineFailure] = [UNREACHABLE]
@@ -102,7 +103,7 @@ def rebooting(*tries: str | MachineFailure, **more: Any) -> Rebooting:
 def test_machine_is_back_when_another_boot_answers(board: type[PlayedBoard]) -> None:
     connection = PlayedConnection()
 
-    done = rebooting("old", UNREACHABLE, LOST, "new").reboot(connection)  # type: ignore[arg-type]
+    done = rebooting("old", UNREACHABLE, LOST, "new").reboot(connection)
 
     assert (done.boot_id, done.back_s) == ("new", 4.0)
     assert board.asked == ["boot", "lock", "reboot"]
@@ -110,7 +111,7 @@ def test_machine_is_back_when_another_boot_answers(board: type[PlayedBoard]) -> 
 
 
 def test_words_of_a_machine_that_runs_nothing_yet_are_no_boot(board: type[PlayedBoard]) -> None:
-    done = rebooting("refused: it is starting", "new").reboot(PlayedConnection())  # type: ignore[arg-type]
+    done = rebooting("refused: it is starting", "new").reboot(PlayedConnection())
 
     assert (done.boot_id, done.back_s) == ("new", 2.0)
 
@@ -118,14 +119,14 @@ def test_words_of_a_machine_that_runs_nothing_yet_are_no_boot(board: type[Played
 def test_connection_that_breaks_on_the_order_is_no_failure(board: type[PlayedBoard]) -> None:
     board.failures["reboot"] = LOST
 
-    assert rebooting("new").reboot(PlayedConnection()).boot_id == "new"  # type: ignore[arg-type]
+    assert rebooting("new").reboot(PlayedConnection()).boot_id == "new"
 
 
 def test_refused_order_is_the_machines_failure(board: type[PlayedBoard]) -> None:
     board.failures["reboot"] = MachineFailure(FailureKind.NO_SUDO, "a password is required")
 
     with pytest.raises(MachineFailure, match="a password is required"):
-        rebooting("new").reboot(PlayedConnection())  # type: ignore[arg-type]
+        rebooting("new").reboot(PlayedConnection())
 
 
 @pytest.mark.parametrize(("uid", "is_done"), [(1000, False), (0, True)])
@@ -137,10 +138,10 @@ def test_sudo_that_the_inventory_forbids_is_not_used(
     board.greeting = {"uid": uid}
 
     if is_done:  # who logs in is root already
-        assert rebooting("new").reboot(connection).boot_id == "new"  # type: ignore[arg-type]
+        assert rebooting("new").reboot(connection).boot_id == "new"
         return
     with pytest.raises(MachineFailure, match="ansible_become: false") as failure:
-        rebooting("new").reboot(connection)  # type: ignore[arg-type]
+        rebooting("new").reboot(connection)
 
     assert failure.value.kind is FailureKind.NO_SUDO
     assert "reboot" not in board.asked
@@ -150,7 +151,7 @@ def test_machine_with_a_run_is_left_to_it(board: type[PlayedBoard]) -> None:
     board.living = [{"run": "0007-iridium10"}, {"run": "0007-iridium10"}]
 
     with pytest.raises(MachineFailure, match="0007-iridium10 lives there") as failure:
-        rebooting("new").reboot(PlayedConnection())  # type: ignore[arg-type]
+        rebooting("new").reboot(PlayedConnection())
 
     assert failure.value.kind is FailureKind.BUSY
     assert "reboot" not in board.asked
@@ -159,7 +160,7 @@ def test_machine_with_a_run_is_left_to_it(board: type[PlayedBoard]) -> None:
 def test_force_takes_the_machine_from_its_run(board: type[PlayedBoard]) -> None:
     board.living = [{"run": "0007-iridium10"}]
 
-    done = rebooting("new", is_forced=True).reboot(PlayedConnection())  # type: ignore[arg-type]
+    done = rebooting("new", is_forced=True).reboot(PlayedConnection())
 
     assert done.boot_id == "new"
     assert board.asked == ["boot", "reboot"]
@@ -169,13 +170,13 @@ def test_machine_at_which_another_command_works_is_left_to_it(board: type[Played
     board.failures["lock"] = MachineFailure(FailureKind.BUSY, "another command works there")
 
     with pytest.raises(MachineFailure, match="another command works there"):
-        rebooting("new").reboot(PlayedConnection())  # type: ignore[arg-type]
+        rebooting("new").reboot(PlayedConnection())
 
 
 def test_disk_that_takes_no_lock_is_no_reason_against_it(board: type[PlayedBoard]) -> None:
     board.failures["lock"] = MachineFailure(FailureKind.READ_ONLY, "Read-only file system")
 
-    assert rebooting("new").reboot(PlayedConnection()).boot_id == "new"  # type: ignore[arg-type]
+    assert rebooting("new").reboot(PlayedConnection()).boot_id == "new"
 
 
 @pytest.mark.parametrize(
@@ -189,7 +190,7 @@ def test_machine_that_is_not_back_in_time_failed(
     board: type[PlayedBoard], tries: list[str | MachineFailure], words: str
 ) -> None:
     with pytest.raises(MachineFailure) as failure:
-        rebooting(*tries).reboot(PlayedConnection())  # type: ignore[arg-type]
+        rebooting(*tries).reboot(PlayedConnection())
 
     assert failure.value.kind is FailureKind.TIMEOUT
     assert failure.value.text == words
@@ -201,7 +202,7 @@ def test_login_that_is_refused_while_it_starts_is_tried_again_later(
 ) -> None:
     refused = MachineFailure(FailureKind.AUTHENTICATION, "not yet")
 
-    done = rebooting(refused, refused, "new").reboot(PlayedConnection())  # type: ignore[arg-type]
+    done = rebooting(refused, refused, "new").reboot(PlayedConnection())
 
     assert done.back_s == 11.0
 
@@ -210,7 +211,7 @@ def test_another_host_key_after_the_reboot_is_not_waited_out(board: type[PlayedB
     changed = MachineFailure(FailureKind.HOST_KEY_CHANGED, "another key")
 
     with pytest.raises(MachineFailure, match="another key"):
-        rebooting(changed, "new").reboot(PlayedConnection())  # type: ignore[arg-type]
+        rebooting(changed, "new").reboot(PlayedConnection())
 
 
 @pytest.mark.process

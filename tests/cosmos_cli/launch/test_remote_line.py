@@ -164,11 +164,10 @@ def test_line_that_makes_no_sense_is_passed_on(line: bytes) -> None:
 
 def test_an_order_and_its_answer_keep_their_number_beside_those_of_the_line(stage: Stage) -> None:
     stream, said = PipeStream(), list[bytes]()
-    supervisor, events = Supervisor.__new__(Supervisor), KeptEvents()
-    supervisor._devices = SimpleNamespace(insert_fault=lambda *fault: "")  # type: ignore[assignment]
-    supervisor._operator = SimpleNamespace(  # type: ignore[assignment]
-        emit=lambda event: said.append(events.add(event))
-    )
+    supervisor: Any = Supervisor.__new__(Supervisor)
+    events = KeptEvents()
+    supervisor._devices = SimpleNamespace(insert_fault=lambda *fault: "")
+    supervisor._operator = SimpleNamespace(emit=lambda event: said.append(events.add(event)))
     stage.line.open(stream)
     stage.line.send(inject(FaultOrdered(7, "pi01/imu", "freeze", None)))
 

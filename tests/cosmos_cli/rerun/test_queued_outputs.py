@@ -110,38 +110,35 @@ PULSE = StreamSchema(
 )
 
 
+def flown_again(folder, driver, simulation):
+    """Fly a device with a simulation, and again; return the rerun's exit code and its channels by name."""
+    (folder / "pulser.py").write_text(driver)
+    (folder / "pulses.py").write_text(simulation)
+    (folder / "pulses.yaml").write_text(SCENARIO)
+    cosmos = CosmosCommand(folder)
+    code, document = cosmos.run(folder / "pulses.yaml")
+    assert code == 0, document["verdict"]
+    done = cosmos("rerun", document["run"], "--json", "--quiet")
+    return done.returncode, {each["name"]: each for each in json.loads(done.stdout)["devices"]}
+
+
 @pytest.mark.process
 def test_a_queue_of_values_of_one_tick_is_the_same_again(tmp_path):
-    (tmp_path / "pulser.py").write_text(DRIVER)
-    (tmp_path / "pulses.py").write_text(SIMULATION)
-    (tmp_path / "pulses.yaml").write_text(SCENARIO)
-    cosmos = CosmosCommand(tmp_path)
-    code, document = cosmos.run(tmp_path / "pulses.yaml")
-    assert code == 0, document["verdict"]
-
-    done = cosmos("rerun", document["run"], "--json", "--quiet")
-    told = {each["name"]: each for each in json.loads(done.stdout)["devices"]}
+    code, told = flown_again(tmp_path, DRIVER, SIMULATION)
 
     pulse = told["agent-01/pulser.pulse"]
     assert (pulse["records"], pulse["compared"], pulse["different"]) == (18, 18, 0)
-    assert done.returncode == 0
+    assert code == 0
 
 
 @pytest.mark.process
 def test_frames_of_which_the_newest_of_a_tick_alone_goes_out_are_the_same_again(tmp_path):
     of_bus = 'Channel(name="bus", direction="out", is_frame=True),'
-    (tmp_path / "pulser.py").write_text(DRIVER.replace("channels=(", f"channels=({of_bus}"))
     twice = SIMULATION.replace('"pulse", 0.1', '"bus", b"a"').replace(
         '"pulse", 0.2', '"bus", b"bc"'
     )
-    (tmp_path / "pulses.py").write_text(twice)
-    (tmp_path / "pulses.yaml").write_text(SCENARIO)
-    cosmos = CosmosCommand(tmp_path)
-    code, document = cosmos.run(tmp_path / "pulses.yaml")
-    assert code == 0, document["verdict"]
 
-    done = cosmos("rerun", document["run"], "--json", "--quiet")
-    told = {each["name"]: each for each in json.loads(done.stdout)["devices"]}
+    _, told = flown_again(tmp_path, DRIVER.replace("channels=(", f"channels=({of_bus}"), twice)
 
     bus = told["agent-01/pulser.bus"]
     assert (bus["records"], bus["compared"], bus["different"]) == (9, 9, 0)
