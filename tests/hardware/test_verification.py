@@ -46,12 +46,32 @@ class Line(Device):
 """
 
 
-def verify(folder, kind, cycles=100, may_write=False, steps=STEPS, **parameters):
+LATE_GUARDIAN = """
+from time import monotonic
+from madns_runtime.hardware.guardian import Guardian
+ended = Guardian._driver_ended
+Guardian._driver_ended = lambda self, *ended_driver: self._reactor.call_at(
+    monotonic() + 1.0, lambda: ended(self, *ended_driver)
+)
+import madns_runtime.hardware.verification.__main__ as verification
+raise SystemExit(verification.main())
+"""
+
+
+def verify(
+    folder,
+    kind,
+    cycles=100,
+    may_write=False,
+    steps=STEPS,
+    how=("-m", "madns_runtime.hardware.verification"),
+    **parameters,
+):
     order = {"kind": kind, "parameters": parameters, "directory": str(folder), "cycles": cycles}
     order["steps"] = steps
     order["may_write"] = may_write
     ended = subprocess.run(
-        [sys.executable, "-m", "madns_runtime.hardware.verification"],
+        [sys.executable, *how],
         input=json.dumps({**order, "rate_hz": 50.0, "sampling_s": 0.4}),
         capture_output=True,
         text=True,
@@ -204,6 +224,16 @@ def test_shipped_kinds_pass(tmp_path, kind):
         assert "is gone" in findings["unplugged"]["got"]
     if kind == "null":
         assert "2 values written" in findings["outputs"]["got"]
+
+
+def test_a_guardian_that_hears_late_leaves_it_to_the_next_process(tmp_path):
+    findings = verify(
+        tmp_path, "null", may_write=True, steps=("process",), how=("-c", LATE_GUARDIAN)
+    )
+    assert (
+        failed(findings, but=("safe after kill -9", "safe after hang", "safe after hang in a call"))
+        == {}
+    )
 
 
 @pytest.mark.parametrize(

@@ -109,6 +109,10 @@ class _DrivenDevice:
     def _lost_by(self, lose: Callable[[], None], how: str, limit_s: float) -> Findings:
         header = self._header
         pid, count = int(header[page.PID]), header[page.SAFE_COUNT]
+        if self._has_outputs:
+            header[page.MOVED] = (
+                1.0  # else the next process leaves it, if it is there before the guardian hears
+            )
         lose()
         safe_s: float | None = 0.0
         extra_s = limit_s - RETURN_S_MAX
