@@ -18,6 +18,10 @@ UBX_SYNC: Final = b"\xb5\x62"
 UBX_HEAD_BYTES: Final = 6
 UBX_CHECKSUM_BYTES: Final = 2
 NMEA_CHECKSUM_DIGITS: Final = 2
+NMEA_RESERVED: Final = b"$*\r\n"
+"""Bytes that begin a sentence, its checksum and its end."""
+SHOWN_BYTES_MAX: Final = 60
+"""Of a frame that is refused."""
 
 
 class Framer:
@@ -94,8 +98,19 @@ class LineFramer(EndedFramer):
     """Beside the frame, on the line before its line feed."""
 
     def wrap(self, frame: bytes) -> bytes:
-        """Return the line with carriage return and line feed."""
-        return frame + b"\r\n"
+        """
+        Return the line with carriage return and line feed; a line end that it brings along is its own.
+
+        Raises:
+            PluginError: It would be several lines.
+        """
+        line = frame[:-1].removesuffix(b"\r") if frame.endswith(b"\n") else frame
+        if b"\n" in line:
+            raise PluginError(
+                f"expected one line, got {1 + line.count(10)}: {frame[:SHOWN_BYTES_MAX]!r}; write each by itself, or use"
+                " framing: raw"
+            )
+        return line + b"\r\n"
 
     def _cut(self, buffer: bytearray) -> tuple[bytes | None, int] | None:
         end = self._cut_to_end(buffer, self._max + self.overhead_bytes)
@@ -120,7 +135,16 @@ class NmeaFramer(LineFramer):
     overhead_bytes = len("$*hh\r")
 
     def wrap(self, frame: bytes) -> bytes:
-        """Return the sentence with its $, checksum and line end."""
+        """
+        Return the sentence with its $, checksum and line end.
+
+        Raises:
+            PluginError: It holds what begins or ends a sentence.
+        """
+        if any(byte in frame for byte in NMEA_RESERVED):
+            raise PluginError(
+                f"expected a sentence without $, checksum and line end, which it is given; got {frame[:SHOWN_BYTES_MAX]!r}"
+            )
         return b"$%b*%02X\r\n" % (frame, _xor(frame))
 
     def _checked(self, line: bytes, used: int) -> tuple[bytes | None, int]:

@@ -6,6 +6,7 @@ import random
 
 import pytest
 
+from madns_runtime.errors import PluginError
 from madns_runtime.hardware.framing import (
     FRAMERS,
     CobsFramer,
@@ -103,6 +104,27 @@ def test_sentence_of_a_receiver_is_checked():
     assert framer.feed(good)[0].startswith(b"GPGGA,092750")
     assert framer.feed(good.replace(b"5321", b"5322")) == []
     assert framer.bad_checksums == 1
+
+
+@pytest.mark.parametrize("frame", [b"GO\nSTOP", b"GO\r\nSTOP\r\n", b"\n\n"])
+def test_several_lines_are_not_sent_as_one_frame(frame):
+    with pytest.raises(PluginError, match="expected one line, got 2: .* or use framing: raw"):
+        LineFramer().wrap(frame)
+
+
+@pytest.mark.parametrize("end", [b"", b"\n", b"\r\n"])
+def test_a_line_that_brings_its_end_along_is_sent_with_one(end):
+    assert LineFramer().wrap(b"GO" + end) == b"GO\r\n"
+
+
+@pytest.mark.parametrize(
+    "frame", [b"$PMTK,1*2F", b"PMTK,1*2F", b"PMTK,1\r\n", b"PMTK\nPMTK", b"$P"]
+)
+def test_what_would_be_another_sentence_is_refused(frame):
+    with pytest.raises(
+        PluginError, match=r"expected a sentence without \$, checksum and line end.*; got b'"
+    ):
+        NmeaFramer().wrap(frame)
 
 
 def test_message_of_a_receiver_is_as_its_description_says():
