@@ -9,6 +9,7 @@ import shutil
 import pytest
 
 from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.hardware.drivers import pwm
 from madns_runtime.hardware.kind_registry import prepare
 from tests.hardware.driving import opened
 
@@ -170,6 +171,42 @@ def test_a_pwm_line_is_asked_for_and_one_that_never_comes_is_told(chip):
 def test_a_safe_duty_beyond_the_limits_is_refused(chip):
     with pytest.raises(PluginError, match="duty: safe value"):
         prepare("pwm", {"low": 0.05, "high": 0.1}, None)
+
+
+@pytest.mark.parametrize("wanted", ["normal", "inversed"])
+def test_a_pwm_line_that_another_program_left_the_other_way_round_is_turned(
+    chip, monkeypatch, wanted
+):
+    line = chip / "pwm0"
+    found = {"normal": "inversed", "inversed": "normal"}[wanted]
+    state = {"polarity": found, "period": "1000", "duty_cycle": "250", "enable": "1"}
+    for name, text in state.items():
+        (line / name).write_text(f"{text}\n")
+    written = []
+
+    def write(path, text):
+        written.append((path.name, text))
+        path.write_text(text)
+
+    monkeypatch.setattr(pwm, "write_text", write)
+    with opened("pwm", root=str(chip.parent), polarity=wanted, safe=0.0, period_s=1e-3):
+        pass
+
+    turned = [("enable", "0"), ("duty_cycle", "0"), ("period", "1000000"), ("polarity", wanted)]
+    assert written == [*turned, ("duty_cycle", "0"), ("enable", "1")]
+    del written[:]
+    with opened("pwm", root=str(chip.parent), polarity=wanted, period_s=1e-3):
+        assert {name for name, _ in written} == {"duty_cycle", "period", "enable"}
+        assert ("enable", "0") not in written
+
+
+def test_a_duty_is_told_by_the_polarity_that_is_asked_for_where_none_may_move(chip):
+    for name, text in {"polarity": "inversed", "period": "1000", "duty_cycle": "250"}.items():
+        (chip / "pwm0" / name).write_text(f"{text}\n")
+
+    with opened("pwm", may_move=False, root=str(chip.parent)) as device:
+        assert device.read().values == {"duty_set": 0.75}
+    assert (chip / "pwm0/polarity").read_text() == "inversed\n"
 
 
 def test_opening_leaves_a_pwm_line_as_it_is_where_none_may_move(chip):

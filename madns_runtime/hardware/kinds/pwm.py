@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le
 
@@ -25,6 +25,8 @@ class PwmParameters:
     high: Annotated[float, Ge(0), Le(1)] = 1.0
     """Limits of the share of the period in which the line is on."""
     safe: Annotated[float, Ge(0), Le(1)] = 0.0
+    polarity: Literal["normal", "inversed"] = "normal"
+    """normal: the line is high while it is on; inversed: it is low."""
     root: str = str(PWM)
     """Folder of all chips."""
 
