@@ -235,6 +235,9 @@ def test_lines_that_do_not_go_together_are_refused():
         prepare("gpio", {"lines": [level, edges]}, None)
     with pytest.raises(PluginError, match="expected each offset once"):
         prepare("gpio", {"lines": [level, {"name": "b", "offset": 1}]}, None)
+    output = {"name": "led", "offset": 3, "mode": "output", "debounce_s": 0.01}
+    with pytest.raises(PluginError, match="lines: led: debounce_s is of inputs"):
+        prepare("gpio", {"lines": [level, output]}, None)
 
 
 def test_opening_moves_no_output_where_none_may_move(requests):

@@ -25,6 +25,7 @@ class GpioLine:
     bias: Literal["as_is", "pull_up", "pull_down", "disabled"] = "as_is"
     active_low: bool = False
     debounce_s: Annotated[float, Ge(0), Le(1)] = 0.0
+    """level and edges: a change that does not last so long is none."""
     safe: Literal[0, 1] = 0
     """output: the state in which it harms nobody."""
 
@@ -44,7 +45,7 @@ def channels_of(parameters: GpioParameters) -> tuple[Channel, ...]:
     Return a channel per line; an edge is 1 for a rising, 0 for a falling one.
 
     Raises:
-        PluginError: Levels and edges are asked for together, or a line twice.
+        PluginError: Levels and edges are asked for together, or a line twice, or an output is to be debounced.
     """
     modes = {line.mode for line in parameters.lines}
     if {"level", "edges"} <= modes:
@@ -54,6 +55,13 @@ def channels_of(parameters: GpioParameters) -> tuple[Channel, ...]:
     offsets = [line.offset for line in parameters.lines]
     if len(set(offsets)) < len(offsets):
         raise PluginError(f"lines: expected each offset once, got {offsets}")
+    if bounced := [
+        each.name for each in parameters.lines if each.mode == "output" and each.debounce_s
+    ]:
+        # The kernel refuses it, and does not say why.
+        raise PluginError(
+            f"lines: {', '.join(bounced)}: debounce_s is of inputs; leave it out of an output"
+        )
     found = []
     for line in parameters.lines:
         if line.mode == "output":
