@@ -53,6 +53,7 @@ _NEED_FORMS: Mapping[str, Any] = {
     "system_modules": Annotated[
         str, like(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*", "the name of a Python module")
     ],
+    "exclusive": Annotated[str, like(r"[^\0\r\n]*\S[^\0\r\n]*", "one line of text")],
 }
 
 

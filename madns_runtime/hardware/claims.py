@@ -1,8 +1,9 @@
 """
 Claims on a machine's devices: two runs that open the same one would spoil each other's reads and outputs.
 
-A claim is a lock on a file in the machine's state folder. Processes that are forked afterwards hold it, too, so that it
-lasts until the last one that has the device open is gone, however it ended.
+A claim is a lock on files in the machine's state folder: one of the device, and one of each part of the machine that its
+kind needs for itself alone, so that the same chip is refused under another name as well. Processes that are forked
+afterwards hold it, too, so that it lasts until the last one that has the device open is gone, however it ended.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, Final
@@ -40,39 +41,61 @@ class DeviceClaims:
 
     def __init__(self, run: str) -> None:
         self._run = run
-        self._descriptors: list[int] = []
+        self._descriptors: dict[Path, int] = {}
         self.problem = ""
         """Why claims cannot be kept here, which is no reason to fail; empty where they can."""
 
-    def claim(self, device: DeviceLaunch, kind: DeviceKind) -> None:
+    def claim(self, device: DeviceLaunch, kind: DeviceKind, exclusive: Sequence[str] = ()) -> None:
         """
         Claim a device of the machine; one of a kind that needs no hardware is open to all.
+
+        Args:
+            device: By its name.
+            kind: Of it.
+            exclusive: Parts of the machine, see `Needs`; several devices of this run may have the same.
 
         Raises:
             MachineError: Another run has it.
         """
         if not kind.needs_hardware:
             return
-        try:
-            descriptor = _open(claim_path(device))
-        except OSError as error:
-            self.problem = f"other runs are not kept from its devices: {error.strerror or error}"
-            return
+        for path, part in [
+            (claim_path(device), ""),
+            *((_path_of(["part", part]), part) for part in sorted(exclusive)),
+        ]:
+            if path in self._descriptors:
+                continue
+            try:
+                descriptor = _open(path)
+            except OSError as error:
+                self.problem = (
+                    f"other runs are not kept from its devices: {error.strerror or error}"
+                )
+                return
+            self._lock(descriptor, device.full_name, part)
+            self._descriptors[path] = descriptor
+
+    def _lock(self, descriptor: int, device: str, part: str) -> None:
+        """
+        Lock a file, and note in it who has what.
+
+        Raises:
+            MachineError: Another run has it.
+        """
         deadline_s = monotonic() + WAIT_S
         while not _is_locked_now(descriptor):
             if monotonic() > deadline_s:
-                holder = _holder(descriptor)
+                holder = _holder(descriptor, device)
                 os.close(descriptor)
+                what = f"device {device}: {part}" if part else f"device {device}"
                 raise MachineError(
-                    f"device {device.full_name} is in use by {holder}: end it (cosmos ps, cosmos down) or wait for"
-                    " its end"
+                    f"{what} is in use by {holder}: end it (cosmos ps, cosmos down) or wait for its end"
                 )
             sleep(POLL_S)
-        told = json.dumps({"run": self._run, "pid": os.getpid()}).encode()
+        told = json.dumps({"run": self._run, "pid": os.getpid(), "device": device}).encode()
         with contextlib.suppress(OSError):  # a full disk: the claim holds all the same
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, told, 0)
-        self._descriptors.append(descriptor)
 
     def tell_problem(self, emit: Callable[[Mapping[str, Any]], None]) -> None:
         """Tell the operator, by an event, if claims cannot be kept here."""
@@ -81,14 +104,17 @@ class DeviceClaims:
 
     def release(self) -> None:
         """Give up what this process claims; harmless when repeated."""
-        for descriptor in self._descriptors:
+        for descriptor in self._descriptors.values():
             os.close(descriptor)
-        self._descriptors = []
+        self._descriptors = {}
 
 
 def claim_path(device: DeviceLaunch) -> Path:
     """Return the file that is locked for a device: of one name, kind, serial and parameters."""
-    key = [device.full_name, device.kind, device.serial, dict(device.parameters)]
+    return _path_of([device.full_name, device.kind, device.serial, dict(device.parameters)])
+
+
+def _path_of(key: Sequence[Any]) -> Path:
     digest = hashlib.sha256(json.dumps(key, sort_keys=True, default=str).encode()).hexdigest()
     return state_directory().parent / FOLDER / f"{digest[:32]}.lock"
 
@@ -106,10 +132,12 @@ def _is_locked_now(descriptor: int) -> bool:
     return True
 
 
-def _holder(descriptor: int) -> str:
-    """Return who has a claim, as far as it is told."""
+def _holder(descriptor: int, device: str) -> str:
+    """Return who has a claim, as far as it is told, and as which device if it is another than *device*."""
     try:
         told = json.loads(os.pread(descriptor, HOLDER_BYTES_MAX, 0))
-        return f"run {clean_text(str(told['run']))[:200]} (pid {int(told['pid'])})"
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        other = clean_text(str(told.get("device", device)))[:200]
+        suffix = "" if other == device else f" as {other}"
+        return f"run {clean_text(str(told['run']))[:200]} (pid {int(told['pid'])}){suffix}"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return "another run"

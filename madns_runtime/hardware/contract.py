@@ -152,6 +152,8 @@ class Needs:
     """Python requirements that pip installs."""
     system_modules: tuple[str, ...] = ()
     """Python modules that only the system's own packages bring (there is no wheel): the environment sees these."""
+    exclusive: tuple[str, ...] = ()
+    """Parts of the machine that no other run may have meanwhile, such as i2c-1 0x1e, by whatever name it lists them."""
 
 
 class Device:

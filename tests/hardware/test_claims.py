@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -17,6 +19,7 @@ from madns_runtime.errors import MachineError
 from madns_runtime.hardware import claims
 from madns_runtime.hardware.claims import DeviceClaims, claim_path
 from madns_runtime.hardware.contract import Channel, DeviceKind
+from madns_runtime.hardware.kind_registry import prepare
 
 DEVICE = DeviceLaunch(
     name="imu",
@@ -57,6 +60,43 @@ def test_other_devices_are_other_claims() -> None:
 
     assert claim_path(other_port) != claim_path(DEVICE)
     assert claim_path(other_folder) == claim_path(DEVICE)
+
+
+MAP = {"registers": [{"name": "level", "address": 1}]}
+LINES = [{"name": "door", "offset": 4}, {"name": "lamp", "offset": 5}]
+SAME: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
+    "i2c": ({"map": MAP, "address": 30}, {"map": MAP, "address": 31}, "i2c-1 0x1e"),
+    "spi": ({"map": MAP}, {"map": MAP, "chip_select": 1}, "spidev0.0"),
+    "pwm": ({"line": 1}, {"line": 0}, "/sys/class/pwm/pwmchip0/pwm1"),
+    "gpio": ({"lines": LINES}, {"lines": [{"name": "x", "offset": 6}]}, "/dev/gpiochip0 line 4"),
+    "analog": (
+        {"inputs": [{"name": "v", "file": "out_voltage0_raw", "is_output": True}]},
+        {"inputs": [{"name": "v", "file": "out_voltage1_raw", "is_output": True}]},
+        "/sys/bus/iio/devices/iio:device0/out_voltage0_raw",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", SAME)
+def test_the_same_chip_under_another_name_is_refused_and_another_one_is_not(kind: str) -> None:
+    given, other_given, part = SAME[kind]
+
+    def claim(by: DeviceClaims, name: str, parameters: dict[str, Any]) -> None:
+        launch = dataclasses.replace(DEVICE, name=name, kind=kind, parameters=parameters)
+        program = prepare(kind, parameters, Path())
+        by.claim(launch, program.kind, program.needs.exclusive)
+
+    first, second = DeviceClaims("0007-hwil"), DeviceClaims("0008-hwil")
+    claim(first, "imu", given)
+    claim(first, "again", given)  # one run may have a chip by two names
+    told = f"device pi22/mine: {re.escape(part)} is in use by run 0007-hwil .* as pi22/imu: end it"
+    with pytest.raises(MachineError, match=told):
+        claim(second, "mine", given)
+    claim(second, "mine", other_given)
+
+    first.release()
+    claim(second, "mine", given)
+    second.release()
 
 
 def test_kinds_that_need_no_hardware_are_open_to_all() -> None:

@@ -67,7 +67,9 @@ def channels_of(parameters: AnalogParameters) -> tuple[Channel, ...]:
 
 def needs_of(parameters: AnalogParameters) -> Needs:
     """Return the folder that must be there."""
-    return Needs(files=(f"{parameters.root}/{parameters.device}",))
+    folder = f"{parameters.root}/{parameters.device}"
+    outputs = tuple(f"{folder}/{each.file}" for each in parameters.inputs if each.is_output)
+    return Needs(files=(folder,), exclusive=outputs)
 
 
 kind = DeviceKind(

@@ -82,7 +82,12 @@ def channels_of(parameters: GpioParameters) -> tuple[Channel, ...]:
 def needs_of(parameters: GpioParameters) -> Needs:
     """Return what the chip needs."""
     file = parameters.chip if "/" in parameters.chip else "/dev/gpiochip*"
-    return Needs(groups=("gpio",), files=(file,), requirements=("gpiod>=2.1",))
+    return Needs(
+        groups=("gpio",),
+        files=(file,),
+        requirements=("gpiod>=2.1",),
+        exclusive=tuple(f"{parameters.chip} line {line.offset}" for line in parameters.lines),
+    )
 
 
 kind = DeviceKind(

@@ -57,6 +57,7 @@ def needs_of(parameters: I2cParameters) -> Needs:
         boot_lines=("dtparam=i2c_arm=on",),
         files=(f"/dev/i2c-{parameters.bus}",),
         requirements=("smbus2>=0.4",),
+        exclusive=(f"i2c-{parameters.bus} 0x{parameters.address:02x}",),
     )
 
 

@@ -46,6 +46,7 @@ def needs_of(parameters: PwmParameters) -> Needs:
         groups=("gpio",),
         boot_lines=("dtoverlay=pwm-2chan",),
         files=(f"{parameters.root}/pwmchip{parameters.chip}",),
+        exclusive=(f"{parameters.root}/pwmchip{parameters.chip}/pwm{parameters.line}",),
     )
 
 

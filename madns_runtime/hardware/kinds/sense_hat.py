@@ -85,6 +85,7 @@ def needs_of(parameters: SenseHatParameters) -> Needs:
         boot_lines=("dtparam=i2c_arm=on",),
         files=("/dev/i2c-1", "/dev/fb*"),
         system_modules=("sense_hat", "RTIMU"),
+        exclusive=("the Sense HAT",),
     )
 
 

@@ -44,6 +44,7 @@ def needs_of(parameters: SpiParameters) -> Needs:
         # There is no wheel of it.
         packages=("python3-spidev",),
         system_modules=("spidev",),
+        exclusive=(f"spidev{parameters.bus}.{parameters.chip_select}",),
     )
 
 

@@ -88,6 +88,7 @@ def test_needs_that_would_be_strange_commands_are_refused():
         files=("dev/x",),
         requirements=("--index-url x",),
         system_modules=("os system",),
+        exclusive=("",),
     )
 
     found = needs_faults(needs)
@@ -99,5 +100,6 @@ def test_needs_that_would_be_strange_commands_are_refused():
         "files",
         "requirements",
         "system_modules",
+        "exclusive",
     ]
     assert needs_faults(Needs(packages=("a1",) * 65)) == ["packages: expected at most 64, got 65"]
