@@ -127,22 +127,32 @@ def sample_here(
     Raises:
         MachinesError: The process that drives them failed, or did not come to an end.
     """
+    # Its other end is closed with this process, however that ends: nobody else ends a session of its own.
+    lifeline, our_end = os.pipe()
     order = {
         "devices": [to_mapping(launch) for launch in launches],
         "seconds": seconds,
         "directory": str(directory),
         "writes": writes,
+        "lifeline": lifeline,
     }
     limit_s = seconds + END_S + Timeouts().loading_s
     try:
         done = run_bounded(
-            PROGRAM, timeout_s=limit_s, stdin=json.dumps(order) + "\n", environment=os.environ
+            PROGRAM,
+            timeout_s=limit_s,
+            stdin=json.dumps(order) + "\n",
+            environment=os.environ,
+            pass_fds=(lifeline,),
         )
     except subprocess.TimeoutExpired:
         raise MachinesError(
             f"the process that drives {', '.join(each.full_name for each in launches)} did not end within"
             f" {limit_s:g} s and was killed: look at its driver and its device"
         ) from None
+    finally:
+        os.close(lifeline)
+        os.close(our_end)
     try:
         told: dict[str, Any] = json.loads(done.stdout)
     except ValueError:

@@ -22,6 +22,7 @@ def run_bounded(
     timeout_s: float,
     stdin: str = "",
     environment: Mapping[str, str] | None = None,
+    pass_fds: Sequence[int] = (),
 ) -> subprocess.CompletedProcess[str]:
     """
     Run a program and return what it printed.
@@ -40,6 +41,7 @@ def run_bounded(
         errors="replace",
         env=environment,
         start_new_session=True,
+        pass_fds=pass_fds,
     ) as process:
         try:
             said, complained = process.communicate(stdin, timeout=timeout_s)

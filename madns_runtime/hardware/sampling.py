@@ -48,6 +48,8 @@ class SamplingOrder:
     """Whether the safe value of each output that may move is put out, twice per second."""
     ends_with_input: bool = False
     """Whether the end of standard input ends it before its time: who gave the order is gone."""
+    lifeline: int | None = None
+    """Descriptor whose end does the same, where standard input is closed behind the order."""
 
 
 def main() -> None:
@@ -103,6 +105,8 @@ def sample(order: SamplingOrder) -> dict[str, Any]:
     reactor.call_at(monotonic() + order.seconds, reactor.stop)
     if order.ends_with_input:
         reactor.add_reader(0, reactor.stop)  # nothing but its end comes after the order
+    if order.lifeline is not None:
+        reactor.add_reader(order.lifeline, reactor.stop)
     if order.writes:
         _write_again(reactor, hardware, order.devices)
     try:

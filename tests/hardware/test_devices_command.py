@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from harness.waiting import is_alive, wait_until
 
 from cosmos_cli.app import run as cosmos
 from hardware.bench import DRIVER, Terminal
@@ -49,6 +53,37 @@ def inventory(folder: Path, *devices: str, connection: str = "local") -> Path:
 def line_device(terminal: Terminal, **parameters: str) -> str:
     values = ", ".join(f"{k}: {v}" for k, v in {"port": terminal.port, **parameters}.items())
     return f"{{name: line, kind: './line.py:Line', rate_hz: {RATE_HZ}, outputs: true, parameters: {{{values}}}}}"
+
+
+GAUGE = """
+import os, time
+from pathlib import Path
+from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Sample
+
+class Gauge(Device):
+    kind = DeviceKind(name="gauge", summary="a gauge", channels=(Channel(name="level"),))
+    def read(self):
+        Path(__file__).with_name("pids").write_text(f"{os.getppid()} {os.getpid()}\\n")
+        return Sample(values={"level": 1.0}, taken_s=time.monotonic())
+"""
+
+
+@pytest.mark.parametrize("word", [signal.SIGKILL, signal.SIGHUP])
+def test_what_drives_a_device_ends_with_its_command_however_that_ends(
+    tmp_path: Path, word: signal.Signals
+) -> None:
+    (tmp_path / "gauge.py").write_text(GAUGE)
+    listed = inventory(tmp_path, "{name: gauge, kind: './gauge.py:Gauge'}")
+    words = ("devices", "test", "-i", str(listed), "--seconds", "3600")
+    command = subprocess.Popen([Path(sys.executable).with_name("cosmos"), *words])
+    pids = tmp_path / "pids"
+    wait_until(lambda: pids.exists() and pids.read_text().endswith("\n"), process=command)
+    supervisor, driver = map(int, pids.read_text().split())
+
+    command.send_signal(word)
+    command.wait()
+
+    wait_until(lambda: not (is_alive(supervisor) or is_alive(driver)))
 
 
 SECONDS = 3
