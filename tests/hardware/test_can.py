@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import errno
+import importlib
+import os
 import socket
 import struct
 import sys
+import threading
 
 import pytest
 
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.hardware.drivers import can as driver
 from madns_runtime.hardware.kind_registry import prepare
+from madns_runtime.hardware.kinds.can import CanParameters
 from tests.hardware.driving import frames, opened
 
 ENGINE = 0x123
@@ -263,3 +267,32 @@ def test_a_bus_that_python_can_does_not_know_and_a_missing_python_can(monkeypatc
         opened("can", library="python-can"),
     ):
         pass
+
+
+def test_a_library_that_does_not_return_writes_to_no_other_file_once_the_bus_is_closed(
+    monkeypatch, tmp_path
+):
+    can = pytest.importorskip("can")
+    python_can = importlib.import_module("madns_runtime.hardware.drivers.python_can")
+    goes_on = threading.Event()
+
+    class Stuck:
+        def recv(self, timeout):
+            goes_on.wait(60.0)
+            return can.Message(arbitration_id=1)
+
+        def shutdown(self):
+            pass
+
+    monkeypatch.setattr(can, "Bus", lambda **options: Stuck())
+    monkeypatch.setattr(python_can, "LISTEN_S", 0.001)
+    bus = python_can.PythonCanBus(CanParameters(library="python-can"))
+    bus.close()
+    files = [os.open(tmp_path / str(n), os.O_RDWR | os.O_CREAT) for n in range(8)]
+
+    goes_on.set()
+    bus._listener.join(60.0)
+
+    assert [os.fstat(file).st_size for file in files] == [0] * 8
+    for file in [*files, bus.fileno()]:
+        os.close(file)

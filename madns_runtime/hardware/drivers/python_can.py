@@ -105,7 +105,10 @@ class PythonCanBus:
         self._has_ended.set()
         self._listener.join(20 * LISTEN_S)
         self._bus.shutdown()
-        os.close(self._signal)
+        if (
+            not self._listener.is_alive()
+        ):  # else it may still write there, and the number would be another file's
+            os.close(self._signal)
 
     def _listen(self) -> None:
         """Take what comes until the bus is closed or gone."""
