@@ -131,6 +131,11 @@ def targets_of(inventory: Sequence[str] | None, limit: str | None) -> list[Targe
     return [target_of(machine) for machine in machines_of(inventory, limit)]
 
 
+def by_name(targets: Iterable[Target]) -> dict[str, Target]:
+    """Return machines as `ConnectOptions.listed` takes them."""
+    return {target.name: target for target in targets}
+
+
 def distinct(planned: Iterable[Target], listed: Iterable[Target] = ()) -> list[Target]:
     """
     Return each machine once.

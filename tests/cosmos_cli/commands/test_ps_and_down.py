@@ -233,6 +233,28 @@ def test_inventory_knows_better_than_runs_where_a_machine_is(
     assert planned == [["192.0.2.3"]]
 
 
+def test_down_reaches_machines_of_runs_where_the_inventory_has_them_by_now(
+    planned: list[list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed: list[str] = []
+
+    def end(fleet: Fleetwide, sources: object, **_: float) -> list[object]:
+        listed.extend(target.address for target in fleet.options.listed.values())
+        return []
+
+    monkeypatch.setattr(Fleetwide, "end", end)
+
+    assert cosmos(["down", "1", "-i", machine_list(tmp_path)]) == 0
+
+    assert set(listed) == {"192.0.2.3"}
+
+
+def machine_list(tmp_path: Path) -> str:
+    inventory = tmp_path / "i.yaml"
+    inventory.write_text("all: {hosts: {pi01: {ansible_host: 192.0.2.3}}}\n")
+    return str(inventory)
+
+
 @pytest.mark.parametrize(
     ("age_s", "words"), [(0.4, "0 s"), (59.9, "59 s"), (185, "3 min 05 s"), (7800, "2 h 10 min")]
 )
