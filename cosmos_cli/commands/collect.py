@@ -10,18 +10,25 @@ import typer
 from cosmos_cli.collect.finish import collect_run
 from cosmos_cli.collect.finished_run import refuse_living, still_running
 from cosmos_cli.collect.machine_retrieval import Retrieved
+from cosmos_cli.collect.machine_sources import RecordingMachines
 from cosmos_cli.collect.retrieval_state import NONE, forget, forgotten_problems
 from cosmos_cli.collect.retrieve import Retrieval, problems_of
 from cosmos_cli.collect.size_bound import parse_size
-from cosmos_cli.commands.fleet_command import FORKS_DEFAULT, AcceptHostKeysOption, ForksOption
+from cosmos_cli.commands.fleet_command import (
+    FORKS_DEFAULT,
+    AcceptHostKeysOption,
+    ForksOption,
+    PresentInventoryOption,
+)
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, alone, runs_root
 from cosmos_cli.evidence.run_documents import Problem
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.failure import MachineFailure
-from cosmos_cli.fleet.outcome import Outcome
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.launch.living_processes import by_name, targets_of
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, losing_output
 from cosmos_cli.ui.plural import counted
 from cosmos_cli.ui.progress import told_progress
@@ -44,6 +51,8 @@ ForgetOption = Annotated[
         " none: ask all again. Repeatable.",
     ),
 ]
+ELSEWHERE_NOW = (FailureKind.UNREACHABLE, FailureKind.REFUSED, FailureKind.HOST_KEY_CHANGED)
+"""Failures of a machine whose address may be another by now."""
 NOT_ASKED = "its records were not fetched, as --no-retrieve says"
 
 
@@ -58,6 +67,7 @@ def collect(
     ] = True,
     size_max: SizeMaxOption = None,
     forget: ForgetOption = None,
+    inventory: PresentInventoryOption = None,
     forks: ForksOption = FORKS_DEFAULT,
     accept_new_host_keys: AcceptHostKeysOption = False,
     as_json: JsonOption = False,
@@ -73,12 +83,17 @@ def collect(
     found = find_run(runs_root(folder), run)
     refuse_living(found, list_processes())
     bytes_max = _bytes_of(size_max)
+    is_asked = retrieve and bool(RecordingMachines.read(found).remote)
+    options = ConnectOptions(
+        accept_new_host_keys=accept_new_host_keys,
+        listed=by_name(targets_of(inventory if is_asked else None, None)),
+    )
     with alone(found):
         _forget(found, forget or [], console)
         with told_progress(console, found.name) as progress:
             retrieval = Retrieval(
                 found,
-                options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
+                options=options,
                 forks=forks,
                 progress=progress,
                 say=console.warn,
@@ -87,6 +102,8 @@ def collect(
             due = [each.machine for each in retrieval.due]
             outcomes = _fetch(found, retrieval, progress) if due and retrieve else []
         tell_outcomes(console, [outcome for outcome in outcomes if outcome.machine in due])
+        if not inventory and any(map(_is_not_reached, failed(outcomes))):
+            console.say(f"at another address by now? cosmos collect {found.shell_path} -i FILE")
         problems = problems_of(outcomes)
         if not retrieve:
             problems = tuple(Problem(machine=name, text=NOT_ASKED, step="collect") for name in due)
@@ -117,6 +134,10 @@ def _forget(run: RunDirectory, names: Sequence[str], console: Console) -> None:
         else:
             again = f"cosmos collect {run.name} --forget {NONE}"
             console.say(f"{machine}: is asked no more; to ask it again: {again}")
+
+
+def _is_not_reached(outcome: Outcome[Retrieved]) -> bool:
+    return outcome.failure is not None and outcome.failure.kind in ELSEWHERE_NOW
 
 
 def _bytes_of(size: str | None) -> int | None:

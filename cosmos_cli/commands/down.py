@@ -32,6 +32,7 @@ from cosmos_cli.launch.living_processes import (
     Fleetwide,
     LivingRun,
     Seen,
+    by_name,
     is_called,
     living_runs,
     targets_of,
@@ -104,12 +105,12 @@ def down(
     not answer, with 1 when something lives still.
     """
     console = Console(json=json, quiet=quiet, instead="the exit code tells what lives still")
+    targets = [t for t in targets_of(inventory, limit) if t.connection != "local"]
     fleet = Fleetwide(
-        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
+        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys, listed=by_name(targets)),
         forks=forks,
         tell=failure_teller(console),
     )
-    targets = [t for t in targets_of(inventory, limit) if t.connection != "local"]
     outcomes = fleet.look(targets)
     known = known_runs(living_runs(), unfinished_runs())
     known += found_runs(known, targets, outcomes)
@@ -152,7 +153,7 @@ def found_runs(
 ) -> list[Doomed]:
     """Return the runs that were seen on machines and that nothing here knows of."""
     planned = {(s.machine, s.directory) for each in known for s in each.there.values()}
-    by_name = {target.name: target for target in targets}
+    target_of = by_name(targets)
     found: dict[str, Doomed] = {}
     for seen in (seen for outcome in outcomes for seen in outcome.value or ()):
         if (seen.machine, seen.directory) in planned:
@@ -160,7 +161,7 @@ def found_runs(
         # One run has a folder of one name on all of its machines.
         folder = Path(seen.directory).name
         doomed = found.setdefault(folder, Doomed(run=seen.entry.run, directory=folder))
-        source = RecordingMachine(target=by_name[seen.machine], directory=seen.directory)
+        source = RecordingMachine(target=target_of[seen.machine], directory=seen.directory)
         doomed.there[seen.machine] = source
         doomed.host = seen.machine if seen.entry.role == "host" else doomed.host
     return sorted(found.values(), key=lambda each: (each.run, each.directory))

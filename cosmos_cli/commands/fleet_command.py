@@ -29,6 +29,7 @@ __all__ = [
     "HostOption",
     "InventoryOption",
     "LimitOption",
+    "PresentInventoryOption",
     "SomeInventoryOption",
     "failure_teller",
     "finish",
@@ -58,6 +59,16 @@ SomeInventoryOption = Annotated[
         envvar="COSMOS_INVENTORY",
         help="Inventory (file, folder, or pi01,pi02, with a comma; repeatable):"
         " the machines to run on; default: this computer alone.",
+    ),
+]
+PresentInventoryOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--inventory",
+        "-i",
+        metavar="FILE",
+        envvar="COSMOS_INVENTORY",
+        help="Inventory (repeatable) that says where a machine is by now that is not reached where it was in the run.",
     ),
 ]
 HostOption = Annotated[

@@ -10,7 +10,7 @@ import typer
 
 from cosmos_cli.collect.log_follower import LogFollower, sources_elsewhere
 from cosmos_cli.collect.machine_sources import HOST, RecordingMachines
-from cosmos_cli.commands.fleet_command import AcceptHostKeysOption
+from cosmos_cli.commands.fleet_command import AcceptHostKeysOption, PresentInventoryOption
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
@@ -18,6 +18,7 @@ from cosmos_cli.evidence.run_log import LogLine, LogReading, in_order
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.fleet.connection import ConnectOptions
+from cosmos_cli.launch.living_processes import by_name, targets_of
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
@@ -63,6 +64,7 @@ def logs(
     level: LevelOption = LogLevel.DEBUG,
     lines: LinesOption = None,
     folder: RunsOption = None,
+    inventory: PresentInventoryOption = None,
     accept_new_host_keys: AcceptHostKeysOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -83,13 +85,17 @@ def logs(
     reading = LogReading(source=source, level=level.value)
     failed: set[str] = set()
     elsewhere = sources_elsewhere(found)
+    options = ConnectOptions(
+        accept_new_host_keys=accept_new_host_keys,
+        listed=by_name(targets_of(inventory if elsewhere else None, None)),
+    )
 
     def follower() -> LogFollower:
         return LogFollower(
             run=found,
             sources=elsewhere,
             reading=reading,
-            options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
+            options=options,
             on_failure=lambda machine, failure: console.say(
                 f"{machine}: its log cannot be read: {failure}"
             ),

@@ -30,6 +30,7 @@ from cosmos_cli.launch.living_processes import (
     Fleetwide,
     LivingRun,
     Seen,
+    by_name,
     distinct,
     in_order,
     is_called,
@@ -94,11 +95,11 @@ def ps(
     planned = [source.target for each in directories for source in asked_sources(each)]
     listed = _others(targets_of(inventory, limit))
     fleet = Fleetwide(
-        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
+        options=ConnectOptions(accept_new_host_keys=accept_new_host_keys, listed=by_name(listed)),
         forks=forks,
         tell=failure_teller(console),
     )
-    outcomes = fleet.look(_others(distinct(planned, listed)))
+    outcomes = fleet.look(_others(distinct([*planned, *listed])))
     living = [*_here(here), *_there(outcomes)]
     parts = [part for part in living if run is None or is_called(part.run, part.directory, run)]
     parts.sort(key=lambda part: (part.run, part.machine or ""))
@@ -110,7 +111,7 @@ def ps(
         where = where_words(len(outcomes) - len(bad))
         console.say(f"no run lives {where}" if run is None else _unknown_words(run, where, living))
     if bad:
-        unasked = compact(outcome.machine for outcome in bad)
+        unasked = compact(dict.fromkeys(outcome.machine for outcome in bad))
         console.say(f"whether a run lives there is not known: {unasked} could not be asked")
     exit_code = ExitCode.MACHINES if bad else ExitCode.OK
     retry = offer_retry_of(console, inventory, listed, [outcome.machine for outcome in bad])

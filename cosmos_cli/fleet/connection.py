@@ -7,7 +7,8 @@ the pool, which waits with a deadline through `cosmos_cli.fleet.liveness.Blockin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -34,6 +35,8 @@ class ConnectOptions:
     """Until a machine is logged in at; ConnectTimeout of the ssh configuration wins."""
     accept_new_host_keys: bool = False
     """Whether unknown host keys are recorded; changed ones are refused whatever stands here."""
+    listed: Mapping[str, Target] = field(default_factory=dict)
+    """By name, where an inventory has machines by now: asked for one that is not reached where a run's plan has it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

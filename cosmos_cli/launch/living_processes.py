@@ -131,17 +131,18 @@ def targets_of(inventory: Sequence[str] | None, limit: str | None) -> list[Targe
     return [target_of(machine) for machine in machines_of(inventory, limit)]
 
 
-def distinct(planned: Iterable[Target], listed: Iterable[Target] = ()) -> list[Target]:
+def by_name(targets: Iterable[Target]) -> dict[str, Target]:
+    """Return machines as `ConnectOptions.listed` takes them."""
+    return {target.name: target for target in targets}
+
+
+def distinct(targets: Iterable[Target]) -> list[Target]:
     """
     Return each machine once.
 
-    Args:
-        planned: Of runs. Two that are called alike, but have different addresses, may be of two laboratories.
-        listed: Of an inventory, which knows better than an earlier run where a machine of its is.
+    Two that are called alike, but have different addresses, may be of two laboratories, also where one is of a run and
+    the other of an inventory. That the inventory knows better where a board is by now, `ConnectOptions.listed` says.
     """
-    listed = list(listed)
-    names = {target.name for target in listed}
-    targets = (*(target for target in planned if target.name not in names), *listed)
     return list({(t.name, t.address, t.user, t.port, t.root): t for t in targets}.values())
 
 

@@ -70,7 +70,8 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     if not steps:
         return
     needed_bytes = sum(step.size_bytes for step in steps) + RESERVE_BYTES
-    if needed_bytes > disk.free_bytes:
+    only_frees = all(step.kind is Kind.PRUNE for step in steps)  # a full disk is a reason for it
+    if needed_bytes > disk.free_bytes and not only_frees:
         raise MachineFailure(
             FailureKind.DISK_FULL,
             f"about {megabytes(needed_bytes)} are needed on {disk.path},"

@@ -52,8 +52,13 @@ def _shown(match: re.Match[str]) -> str:
 def _bounded(text: str, length_max: int | None) -> str:
     if length_max is None or len(text) <= length_max:
         return text
-    note = f"... ({len(text) - length_max} characters more)"
-    kept = max(0, length_max - len(note))
-    if not kept:
-        return text[:length_max]
-    return f"{text[:kept]}... ({len(text) - kept} characters more)"[:length_max]
+    # The note takes room itself, so that more is cut, whose number may have one digit more.
+    for kept in range(length_max - len(_cut_note(len(text) - length_max)), 0, -1):
+        note = _cut_note(len(text) - kept)
+        if kept + len(note) <= length_max:
+            return text[:kept] + note
+    return text[:length_max]
+
+
+def _cut_note(count: int) -> str:
+    return f"... ({count} characters more)"

@@ -75,6 +75,29 @@ def test_records_of_all_machines_come_and_the_run_is_judged(split, capsys):
     assert f"packed: {split.run.bundle}" in err
 
 
+def test_machine_with_another_address_by_now_is_asked_where_an_inventory_has_it(
+    split, network, monkeypatch, tmp_path, capsys
+):
+    inventory = tmp_path / "moved.yaml"
+    inventory.write_text("all: {hosts: {pi01: {ansible_host: 192.0.2.9}}}\n")
+    network.off.add("pi01")
+
+    def listed(target, options):
+        moved = options.listed.get(target.name)
+        if moved is not None:
+            network.off.discard(target.name)
+            assert moved.address == "192.0.2.9"
+        return network.connect(target, options)
+
+    monkeypatch.setattr(retrieve, "_connect", listed)
+
+    assert app.run(["collect"]) == 5
+    assert f"at another address by now? cosmos collect {split.run.path} -i FILE" in (
+        capsys.readouterr().err
+    )
+    assert app.run(["collect", "-i", str(inventory)]) == 0
+
+
 def test_package_that_was_not_written_is_not_said_to_be_there(split, monkeypatch, capsys):
     monkeypatch.setattr(finish, "pack_run", full_disk.refuse)
 

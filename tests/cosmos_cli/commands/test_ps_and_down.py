@@ -222,15 +222,53 @@ def test_machines_of_two_runs_that_are_called_alike_are_both_asked(
     assert "1 agent " in told, "what both told is one process"
 
 
-def test_inventory_knows_better_than_runs_where_a_machine_is(
-    planned: list[list[str]], tmp_path: Path
+def test_inventory_of_another_laboratory_hides_no_living_run(
+    planned: list[list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COSMOS_INVENTORY", machine_list(tmp_path))
+
+    assert cosmos(["ps"]) == 0
+
+    assert planned == [["192.0.2.1", "192.0.2.2", "192.0.2.3"]]
+
+
+def test_ps_reaches_machines_of_runs_where_the_inventory_has_them_by_now(
+    planned: list[list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look = Fleetwide.look
+    listed: list[str] = []
+
+    def noting(fleet: Fleetwide, targets: Iterable[Target]) -> list[Outcome[list[Seen]]]:
+        listed.extend(target.address for target in fleet.options.listed.values())
+        return look(fleet, targets)
+
+    monkeypatch.setattr(Fleetwide, "look", noting)
+
+    assert cosmos(["ps", "-i", machine_list(tmp_path)]) == 0
+
+    assert listed == ["192.0.2.3"]
+
+
+def test_down_reaches_machines_of_runs_where_the_inventory_has_them_by_now(
+    planned: list[list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed: list[str] = []
+
+    def end(fleet: Fleetwide, sources: object, **_: float) -> list[object]:
+        listed.extend(target.address for target in fleet.options.listed.values())
+        return []
+
+    monkeypatch.setattr(Fleetwide, "end", end)
+
+    assert cosmos(["down", "1", "-i", machine_list(tmp_path)]) == 0
+
+    assert set(listed) == {"192.0.2.3"}
+
+
+def machine_list(tmp_path: Path) -> str:
     inventory = tmp_path / "i.yaml"
     inventory.write_text("all: {hosts: {pi01: {ansible_host: 192.0.2.3}}}\n")
-
-    assert cosmos(["ps", "-i", str(inventory)]) == 0
-
-    assert planned == [["192.0.2.3"]]
+    return str(inventory)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ import pytest
 from harness.waiting import wait_until
 
 from cosmos_cli.fleet import fleet as module
+from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.fleet import Fleet, fleet_of
-from cosmos_cli.fleet.open_connection import OPENERS
+from cosmos_cli.fleet.open_connection import OPENERS, connect
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.models.connection_kind import (
     CONNECTION_OF_WORD,
@@ -118,3 +119,47 @@ def test_task_is_given_what_the_inventory_says_of_its_machine(connections, tmp_p
 def test_every_kind_of_connection_has_its_way_to_be_opened_and_every_word_of_ansible_a_kind():
     assert set(OPENERS) == set(get_args(ConnectionKind)) == set(CONNECTION_OF_WORD.values())
     assert set(CONNECTION_OF_WORD) == set(get_args(AnsibleConnection))
+
+
+@pytest.fixture
+def network(monkeypatch):
+    """The addresses that answer."""
+    answering = set()
+
+    def open_(target, _options):
+        if target.address not in answering:
+            text = f"{target.address} port 22: no route"
+            raise MachineFailure(FailureKind.UNREACHABLE, text, "is it switched on?")
+        return Pretended(target)
+
+    monkeypatch.setitem(OPENERS, "ssh", open_)
+    return answering
+
+
+MOVED = Target(name="pi1", address="10.0.9.1", user="pi", root="~/other")
+LISTED = ConnectOptions(listed={"pi1": MOVED})
+
+
+def test_machine_that_has_another_address_by_now_is_reached_where_the_inventory_has_it(network):
+    network.add("10.0.9.1")
+
+    found = connect(TARGETS[1], LISTED).target
+
+    assert (found.address, found.user, found.root) == ("10.0.9.1", "pi", TARGETS[1].root)
+
+
+def test_machine_that_answers_where_it_was_is_not_looked_for_elsewhere(network):
+    network |= {"10.0.0.1", "10.0.9.1"}
+
+    assert connect(TARGETS[1], LISTED).target == TARGETS[1]
+
+
+def test_machine_that_answers_nowhere_is_told_with_both_addresses(network):
+    with pytest.raises(MachineFailure) as caught:
+        connect(TARGETS[1], LISTED)
+    assert "10.0.0.1 port 22: no route; and where the inventory has it, 10.0.9.1" in str(
+        caught.value
+    )
+    with pytest.raises(MachineFailure) as caught:
+        connect(TARGETS[2], LISTED)
+    assert "inventory" not in str(caught.value)

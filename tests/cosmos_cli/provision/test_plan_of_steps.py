@@ -14,6 +14,7 @@ from cosmos_cli.models.machine_facts import MachineFacts
 from cosmos_cli.onboard.facts import _file
 from cosmos_cli.onboard.files import replace_file
 from cosmos_cli.provision.gather_facts import gather_facts
+from cosmos_cli.provision.step import Kind, Step
 from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, notes_of, plan_steps
 from cosmos_cli.provision.up import MachineUp, UpOptions
 from cosmos_cli.provision.up_table import MachineResult
@@ -190,6 +191,14 @@ def test_full_disk_is_refused_before_anything_is_sent():
         "disk_full",
         "about 116 MB are needed on /home/pi, 116 MB are free",
     )
+
+
+def test_full_disk_is_pruned_where_nothing_else_is_to_be_done():
+    prune = Step(kind=Kind.PRUNE, title="prune what nobody uses: trees/0")
+
+    check_possible(facts_of(disk={"free_bytes": 500_000}), (prune,))
+
+    assert refused((*ROOTLESS, prune), disk={"free_bytes": 500_000})[0] == "disk_full"
 
 
 def test_read_only_disk_and_foreign_folder_are_refused():
