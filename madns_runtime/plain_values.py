@@ -45,15 +45,21 @@ def mapping_at(mapping: Mapping[str, Any] | None, *keys: str) -> Mapping[str, An
     return value if isinstance(value, Mapping) else {}
 
 
-def written_name(field: str) -> str:
-    """Return the key of a dataclass's field: one that Python keeps for itself, such as `while`, ends with _ there."""
-    return field[:-1] if field.endswith("_") else field
+def written_name(cls: type, field: str) -> str:
+    """
+    Return the key of a dataclass's field.
+
+    It is its name, as in `lambda_` of a plug-in's parameters; a class that has one by a word which Python keeps for
+    itself tells it in `__written_names__`, such as while_ to while.
+    """
+    names: Mapping[str, str] = getattr(cls, "__written_names__", {})
+    return names.get(field, field)
 
 
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [each.name for each in dataclasses.fields(value) if each.init]
-        return {written_name(name): _plain(getattr(value, name)) for name in fields}
+        return {written_name(type(value), name): _plain(getattr(value, name)) for name in fields}
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

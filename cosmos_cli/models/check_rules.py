@@ -56,6 +56,8 @@ FRAMEWORKS_OWN = (
 class CheckRule(BoundsRule):
     """An expectation: a statistic of a recorded field with a limit, or an event that must or must not occur."""
 
+    __written_names__ = {"while_": "while"}
+
     name: CheckName
     """Name of the check in results."""
     stream: NonBlank | None = None

@@ -318,4 +318,4 @@ def _fields(kind: Any) -> dict[str, Any]:
     else:
         names = list(getattr(kind, "model_fields", ()))
     hints = typing.get_type_hints(kind, include_extras=True) if names else {}
-    return {written_name(name): hints[name] for name in names}
+    return {written_name(kind, name): hints[name] for name in names}

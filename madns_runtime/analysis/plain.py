@@ -31,6 +31,9 @@ def to_plain(value: Any) -> Any:
         fields = {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {KIND: type(value).__name__, "fields": fields}
     if isinstance(value, np.ndarray):
+        if type(value) is not np.ndarray or value.dtype.kind != "f":
+            # Of a document: as floats, whole numbers would lose their last digits, and what a mask hides would show.
+            return to_plain(value.tolist())
         data = np.ascontiguousarray(value, dtype="<f8")
         text = base64.b64encode(data.tobytes()).decode("ascii")
         return {KIND: ARRAY, "data": text, SHAPE: list(value.shape)}

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import types
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from itertools import repeat
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
+from annotated_types import Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen
+
+UNIONS = (Union, types.UnionType)
 
 
 def bound_faults(value: Any, path: str) -> list[str]:
@@ -18,29 +22,60 @@ def bound_faults(value: Any, path: str) -> list[str]:
 
 
 def _faults(hint: Any, value: Any, path: str) -> Iterator[str]:
-    arguments = get_args(hint)
-    if get_origin(hint) is Annotated:
+    """Yield what is wrong with a value of a kind that it is of; None is no value, and has no bounds."""
+    if value is None:
+        return
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
         yield from _faults(arguments[0], value, path)
-        for bound in arguments[1:]:
+        for bound in _single(arguments[1:]):
             if (wanted := _beyond(bound, value)) is not None:
                 yield f"{path}: expected {wanted}, got {value!r:.80}"
-    elif get_origin(hint) is Literal:
+    elif origin is Literal:
         if value not in arguments:
             yield f"{path}: expected one of {', '.join(map(str, arguments))}; got {value!r:.80}"
+    elif origin in UNIONS:
+        found = [[*_faults(each, value, path)] for each in arguments if _may_be(each, value)]
+        if all(found):  # it keeps the bounds of no member
+            yield from next(iter(found), ())
     elif is_dataclass(value):
-        if is_dataclass(hint) or hint is type(value):
-            yield from bound_faults(value, path)
-    elif isinstance(value, tuple) and arguments:
-        for number, each in enumerate(value):
-            yield from _faults(arguments[0], each, f"{path}[{number}]")
-    elif value is not None and type(None) in arguments:
-        for each in arguments:
-            if get_origin(each) is Annotated:
-                yield from _faults(each, value, path)
+        yield from bound_faults(value, path)
+    elif isinstance(value, tuple | list) and arguments:
+        is_fixed = origin is tuple and arguments[-1] is not ...
+        kinds = arguments if is_fixed else repeat(arguments[0])
+        for number, (kind, each) in enumerate(zip(kinds, value, strict=False)):
+            yield from _faults(kind, each, f"{path}[{number}]")
+    elif isinstance(value, Mapping) and len(arguments) > 1:
+        for key, each in value.items():
+            yield from _faults(arguments[1], each, f"{path}.{key}")
+
+
+def _may_be(hint: Any, value: Any) -> bool:
+    """Tell whether a value may be of a member of a union."""
+    origin = get_origin(hint)
+    if origin is Annotated:
+        return _may_be(get_args(hint)[0], value)
+    if origin is Literal:
+        return value in get_args(hint)
+    kind = origin or hint
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if kind is int and isinstance(value, bool):
+        return False
+    return isinstance(value, kind) if isinstance(kind, type) else True
+
+
+def _single(bounds: Iterable[Any]) -> Iterator[Any]:
+    """Yield bounds one by one: such as Interval and Len are several."""
+    for bound in bounds:
+        if isinstance(bound, GroupedMetadata):
+            yield from bound
+        else:
+            yield bound
 
 
 def _beyond(bound: Any, value: Any) -> str | None:
-    """Return what a bound wants if a value does not keep it; None is let through: it is no value."""
+    """Return what a bound wants if a value does not keep it; None if it does."""
     if isinstance(bound, MinLen):
         return f"at least {bound.min_length}" if len(value) < bound.min_length else None
     if isinstance(bound, MaxLen):

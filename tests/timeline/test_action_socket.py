@@ -3,10 +3,12 @@
 import dataclasses
 import selectors
 import socket
-from typing import Any
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import orjson
 import pytest
+from annotated_types import Gt, Interval, Len, Lt
 
 from madns_runtime.hardware.action_socket import (
     AGENTS_TOLD_MAX,
@@ -169,3 +171,51 @@ def test_a_long_order_is_judged_as_any_other(tmp_path):
 
     assert answer == {"refusal": ""}
     assert len(ordered) == 1
+
+
+Positive = Annotated[float, Gt(0)]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Wheel:
+    radius_m: Positive = 1.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sail:
+    angle_deg: Annotated[float, Lt(90)] = 0.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Bounded:
+    limit_m: Annotated[float | None, Gt(0)] = None
+    share: Annotated[float, Interval(ge=0, le=1)] = 0.5
+    points_m: Annotated[tuple[float, ...], Len(1, 2)] = (1.0,)
+    pair: tuple[Positive, float] = (1.0, -1.0)
+    parts_m: Mapping[str, Positive] | None = None
+    either: Positive | str = "none"
+    drive: Wheel | Sail = Wheel()
+
+
+@pytest.mark.parametrize(
+    ("given", "refusal"),
+    [
+        ({}, ""),
+        ({"limit_m": -1}, "limit_m: expected more than 0, got -1.0"),
+        ({"share": 2}, "share: expected at most 1, got 2.0"),
+        ({"points_m": [1, 2, 3]}, "points_m: expected at most 2, got (1.0, 2.0, 3.0)"),
+        ({"pair": [2, -2]}, ""),
+        ({"pair": [-2, 2]}, "pair[0]: expected more than 0, got -2.0"),
+        ({"parts_m": {"left": 0}}, "parts_m.left: expected more than 0, got 0.0"),
+        ({"either": 0}, "either: expected more than 0, got 0.0"),
+        ({"either": "all"}, ""),
+        ({"drive": {"angle_deg": 100}}, "drive.angle_deg: expected less than 90, got 100.0"),
+    ],
+)
+def test_an_order_is_held_to_the_bounds_to_which_a_timeline_holds_it(tmp_path, given, refusal):
+    kind = ActionKind(word="turn", summary="Turns.", parameters=Bounded, lasting="never")
+    order = {"target": "agent-0001", "action": "turn", "parameters": given}
+
+    answer = answer_to(order, tmp_path, declared=(kind,))
+
+    assert answer["refusal"] == (f"turn.{refusal}" if refusal else "")

@@ -413,3 +413,37 @@ def test_a_whole_number_does_as_the_default_of_a_float(tmp_path, kind, default):
     (tmp_path / "a.yaml").write_text("name: a\nsimulation: ./odd.py:simulation\nagents: {count: 1}")
 
     load_scenario(tmp_path / "a.yaml")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wave:
+    lambda_: Annotated[float, Gt(0)] = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waves:
+    x_: int = 1
+    wave: Wave = Wave()
+
+
+def test_a_field_whose_name_ends_with_an_underscore_is_written_as_it_is_called(tmp_path):
+    (tmp_path / "waves.py").write_text(
+        "from dataclasses import dataclass, field\n"
+        "from madns_runtime.plugin.api import ActionKind, AgentSimulation, Simulation\n"
+        "@dataclass(frozen=True, kw_only=True)\nclass Wave:\n    lambda_: float = 2.0\n"
+        "@dataclass(frozen=True, kw_only=True)\nclass Waves:\n    wave: Wave = Wave()\n"
+        "class Agent(AgentSimulation):\n    pass\n"
+        "simulation = Simulation(name='w', parameters=Waves, agent=':Agent',\n"
+        "    actions=(ActionKind(word='dim', summary='Dims.', parameters=Wave, lasting='never'),))\n"
+    )
+    (tmp_path / "a.yaml").write_text(
+        "name: a\nsimulation: ./waves.py:simulation\nagents: {count: 1}\ntime: {duration_s: 2}\n"
+        "parameters: {wave: {lambda_: 3}}\n"
+        "timeline: [{at_s: 1, action: dim, agents: [agent-01], lambda_: 4}]\n"
+    )
+    scenario = load_scenario(tmp_path / "a.yaml")
+
+    assert scenario.to_mapping()["parameters"] == {"wave": {"lambda_": 3.0}}
+    assert from_mapping(Waves, to_mapping(Waves(x_=5, wave=Wave(lambda_=4.0)))) == Waves(
+        x_=5, wave=Wave(lambda_=4.0)
+    )

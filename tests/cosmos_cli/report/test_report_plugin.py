@@ -197,8 +197,20 @@ def test_comparison_of_a_plug_in_that_fails_is_told_and_the_records_are_compared
     ]
 
 
-ARRAYS = "{'x_m': np.array([1.0, np.nan]), 'mean_m': float('nan'), 'count': np.int64(2)}"
-PLAIN = {"x_m": [1.0, None], "mean_m": None, "count": 2}
+ARRAYS = (
+    "{'x_m': np.array([1.0, np.nan]), 'mean_m': float('nan'), 'count': np.int64(2),"
+    " 'numbers': np.array([2**53 + 1]), 'is_there': np.array([True]), 'names': np.array(['agent-01']),"
+    " 'masked_m': np.ma.masked_array([1.0, 2.0], [False, True])}"
+)
+PLAIN = {
+    "x_m": [1.0, None],
+    "mean_m": None,
+    "count": 2,
+    "numbers": [2**53 + 1],
+    "is_there": [True],
+    "names": ["agent-01"],
+    "masked_m": [1.0, None],
+}
 
 
 def test_arrays_and_numbers_that_are_not_finite_are_lists_and_null_in_the_json(
