@@ -114,7 +114,7 @@ class ConstellationAgent(AgentSimulation):
         self._is_commanded = self._cockpit is not None or self._devices is not None
         self._phase_s = 0.0
         self._is_lost = False
-        self._ticks_lost = self._messages_lost = 0
+        self._ticks_lost = self._messages_lost = self._radio_lost = 0
         self._flight_tick = 0
         self._has_early_steps = self._cockpit is not None and self._rate.steps_per_tick > 1
         self._has_begun = False
@@ -244,6 +244,7 @@ class ConstellationAgent(AgentSimulation):
         """Take a message by radio; a broadcast also reaches those who fly nothing."""
         if self._is_lost:
             self._messages_lost += 1
+            self._radio_lost += delivery.sender != GROUND
         elif self._cockpit is not None:
             self._cockpit.deliver(delivery)
 
@@ -356,17 +357,19 @@ class ConstellationAgent(AgentSimulation):
         return {"while_lost": {"ticks": self._ticks_lost, "messages": self._messages_lost}}
 
     def _message_counts(self) -> dict[str, int]:
-        """Return the counts of messages by radio; without flight software nobody heard them."""
+        """Return the counts of messages by radio, as flight software heard them; without it nobody did."""
         counts = self._context.message_counts()
         if self._cockpit is None:
             return {
                 "messages_unheard": sum(counts[name] for name in ("received", "held", "no_room"))
             }
+        # What came in a tick is told in flight software's next step: at its own rate that is later, or never.
+        waiting, dropped = self._cockpit.unheard()
         return {
-            "messages_received": counts["received"],
-            "messages_held": counts["held"],
+            "messages_received": counts["received"] - waiting - dropped - self._radio_lost,
+            "messages_held": counts["held"] + waiting,
             "messages_late": counts["late"],
-            "messages_refused": counts["no_room"],
+            "messages_refused": counts["no_room"] + dropped,
             "messages_unheard": 0,
         }
 

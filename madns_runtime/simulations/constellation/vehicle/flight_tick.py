@@ -35,6 +35,7 @@ from madns_runtime.simulations.constellation.flight.process import ExternalFligh
 from madns_runtime.simulations.constellation.flight_rates import FlightRate, flight_rate
 from madns_runtime.simulations.constellation.flight_settings import FlightClass, FlightRule
 from madns_runtime.simulations.constellation.messages import (
+    GROUND,
     CommandResult,
     Delivery,
     Initial,
@@ -95,6 +96,8 @@ class Cockpit:
         self._news: dict[str, deque[Reading]] = {}
         """Measurements since the step before."""
         self._news_dropped = self._messages_dropped = 0
+        self._radio_dropped = 0
+        """Of the messages dropped those that a radio brought."""
         self.phase_s = 0.0
         """By how much the vehicle's ticks lie behind their nominal times, s."""
         self.refuse = board.refuse
@@ -186,11 +189,16 @@ class Cockpit:
         return [one for one in messages if one.arrives_s <= until_s]
 
     def deliver(self, message: Delivery) -> None:
-        """Take a message by radio, to be told in the next step."""
+        """Take a message by radio, or a text that came by none, to be told in the next step."""
         if len(self._messages) >= MESSAGES_MAX:
-            self._messages.pop(0)
             self._messages_dropped += 1
+            self._radio_dropped += self._messages.pop(0).sender != GROUND
         self._messages.append(message)
+
+    def unheard(self) -> tuple[int, int]:
+        """Return how many messages by radio still wait for a step, and how many had no room to."""
+        waiting = sum(message.sender != GROUND for message in self._messages)
+        return waiting, self._radio_dropped
 
     def read_gauges(self, result: CommandResult) -> None:
         """Let the next step read the gauges of what a command has changed, and not before it has."""
