@@ -149,6 +149,16 @@ def test_fast_flight_software_hears_nothing_before_it_has_arrived(fly):
     assert all(arrives_s <= times_s[step] + 1e-9 for step, arrives_s in heard)
 
 
+def test_messages_of_fast_flight_software_are_on_record_with_the_time_at_which_they_leave(fly):
+    star = fly(50.0, count=2, settings={"talks": True}, crosslinks={"range_km_max": 40_000.0})
+    sent = [row for row in star.contexts["agent-01"].records["messages"] if row[1] == "sent"]
+    of_links_s = [row[0] for row in star.context.records["links"]]
+
+    assert len(of_links_s) > 50
+    assert [row[3] for row in sent][: len(of_links_s)] == of_links_s
+    assert {row[4] - row[3] for row in sent} == {0.0}
+
+
 def test_a_message_that_waits_for_a_step_at_the_end_of_the_run_is_held_and_not_received(fly):
     radio = {"range_km_max": 40_000.0}
     star = fly(0.4, count=2, until_s=6.0, settings={"talks": True}, crosslinks=radio)

@@ -145,7 +145,7 @@ class ConstellationAgent(AgentSimulation):
         if cockpit is not None:
             cockpit.phase_s = phase_s
             if self._has_early_steps:
-                self._step_early(index, cockpit)
+                self._step_early(index, t_s, cockpit)
         state = self._buffer.lookup(t_s)
         if state is not None:
             x, y, z = state[:3]
@@ -170,14 +170,14 @@ class ConstellationAgent(AgentSimulation):
         if self._stimuli is not None:
             self._stimuli.step(t_s)
 
-    def _step_early(self, tick: int, cockpit: Cockpit) -> None:
+    def _step_early(self, tick: int, tick_s: float, cockpit: Cockpit) -> None:
         """Do the steps of flight software since the tick before, but the one at the tick's own time."""
         has_begun, self._has_begun = self._has_begun, True
         # Who has just begun, or rejoined, was not there yet.
         for t_s in self._rate.early_times_s(tick) if has_begun else ():
             state = self._buffer.lookup(t_s)
             self._measure(tick, t_s, state)
-            cockpit.step(tick, t_s, state, is_early=True)
+            cockpit.step(tick, t_s, state, tick_s=tick_s)
 
     def _measure(self, tick: int, t_s: float, state: tuple[float, ...] | None) -> None:
         if self._sensors is not None:

@@ -114,7 +114,7 @@ class Cockpit:
         t_s: float,
         state: tuple[float, ...] | None,
         *,
-        is_early: bool = False,
+        tick_s: float | None = None,
     ) -> None:
         """
         Do one step; one without truth has no readings, but flight software runs all the same.
@@ -123,14 +123,14 @@ class Cockpit:
             tick: Its number.
             t_s: Its time.
             state: Truth, or None.
-            is_early: Whether its time is before the tick's own: what came since the tick before is not told then,
-                but messages that had arrived by that time.
+            tick_s: The tick's own time where the step's is before it, else None: what came since the tick before is not
+                told then, but messages that had arrived by the step's time; and what it sends leaves at the tick's.
 
         Raises:
             BlamedError: Flight software raised.
         """
-        board = self._board
-        board.begin(tick, t_s, self.phase_s)
+        board, is_early = self._board, tick_s is not None
+        board.begin(tick, t_s, self.phase_s, leaves_s=tick_s)
         readings = self._read(t_s, state)
         # Most steps find nothing that came.
         if self._messages:
