@@ -123,6 +123,11 @@ class VehicleContext:
         self._leaves_s = t_s if leaves_s is None else leaves_s
         self._messages_in_tick = 0
 
+    def begin_answer(self) -> None:
+        """Take what a program says from here on as its answer to another tick, whose bounds are its own."""
+        self.desk.begin_answer()
+        self._messages_in_tick = 0
+
     # What flight software calls --------------------------------------------------------------
 
     def send(self, to: str, payload: Any) -> int:
