@@ -433,6 +433,33 @@ for line in sys.stdin:
     assert ship.late["got"] == 0
 
 
+@pytest.mark.parametrize("rate_hz", [HZ, 5.0 * HZ])
+def test_one_that_catches_up_in_real_time_may_command_by_each_answer_what_a_tick_may(
+    tmp_path, rate_hz
+):
+    gate = tmp_path / "gate"
+    body = f"""
+import os, time
+while not os.path.exists({str(gate)!r}):
+    time.sleep(0.001)
+command = {{"delta_v_m_s": [0, 0.001, 0], "at_s": tick["t_s"] + 5}}
+said = {{"commands": [command] * 3, "send": [{{"to": "agent-02", "payload": 1}}] * 12}}
+print(json.dumps(said), flush=True)
+"""
+    flight, command = {"rate_hz": rate_hz}, program(tmp_path, body)
+    with Ship(tmp_path, command, is_lockstep=False, flight=flight, crosslinks={}) as ship:
+        software = ship.agent._cockpit._software
+        ship.run(12)
+        asked = software._counts["ticks_sent"]
+        gate.touch()
+        wait_until(lambda: lines_of(software._link._thread) >= asked)
+        ship.run(1)
+
+    numbers = [row[1] for row in ship.context.records["commands"]]
+    assert numbers[: 3 * asked] == list(range(3 * asked))
+    assert len(ship.context.records["messages"]) >= 12 * asked
+
+
 def test_a_program_that_falls_behind_is_sent_no_more_than_it_can_hold(tmp_path):
     # It reads nothing at all after the setup line.
     command = program(tmp_path, "sys.stdin.read()")

@@ -11,6 +11,7 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.simulations.constellation.check import find_faults
 from madns_runtime.simulations.constellation.flight.api import Reading, StepReadings
 from madns_runtime.simulations.constellation.flight_rates import FlightRate, flight_rate
+from madns_runtime.simulations.constellation.messages import GroundText
 
 LOGGER = """
 import json
@@ -146,6 +147,28 @@ def test_fast_flight_software_hears_nothing_before_it_has_arrived(fly):
 
     assert len(heard) > 50
     assert all(arrives_s <= times_s[step] + 1e-9 for step, arrives_s in heard)
+
+
+def test_messages_of_fast_flight_software_are_on_record_with_the_time_at_which_they_leave(fly):
+    star = fly(50.0, count=2, settings={"talks": True}, crosslinks={"range_km_max": 40_000.0})
+    sent = [row for row in star.contexts["agent-01"].records["messages"] if row[1] == "sent"]
+    of_links_s = [row[0] for row in star.context.records["links"]]
+
+    assert len(of_links_s) > 50
+    assert [row[3] for row in sent][: len(of_links_s)] == of_links_s
+    assert {row[4] - row[3] for row in sent} == {0.0}
+
+
+def test_a_message_that_waits_for_a_step_at_the_end_of_the_run_is_held_and_not_received(fly):
+    radio = {"range_km_max": 40_000.0}
+    star = fly(0.4, count=2, until_s=6.0, settings={"talks": True}, crosslinks=radio)
+    # A text by no radio, which waits as well, is no message of the radio's account.
+    star.agents["agent-02"].receive(GroundText(t_s=6.0, text="report").to_message())
+    counts = star.summaries()["agent-02"]
+
+    assert len(told(star, "heard", "agent-02")) == 2
+    assert [counts[f"messages_{name}"] for name in ("received", "held", "refused")] == [2, 1, 0]
+    assert star.context.account("links").handed_over == 3
 
 
 def test_fast_flight_software_commands_in_its_own_time_and_hears_the_result_at_a_tick(fly):

@@ -1,6 +1,7 @@
 """Flight software in a rerun: what can be stepped flies, what is behind a device or was attached to is played back."""
 
 from dataclasses import replace
+from itertools import groupby
 from types import SimpleNamespace
 
 import pytest
@@ -145,6 +146,36 @@ def test_recorded_commands_are_given_in_their_ticks_and_those_of_devices_are_not
     context.name = "agent-02"
     with pytest.raises(BlamedError, match="expected the commands of the recorded run, found none"):
         RecordedCommands().setup(context)
+
+
+def test_recorded_commands_of_several_answers_that_came_at_once_are_given_again(tmp_path):
+    names = ("tick", "number", "kind", "at_s", "frame", "x", "y", "z", "duration_s")
+    fields = ",".join(f'{{"name":"{name}","unit":"","kind":"float"}}' for name in names)
+    rows = "".join(f'[2,{n},"delta_v",1.5,"rtn",0.0,0.1,0.0,0.0]\n' for n in range(40))
+    folder = tmp_path / "agent-01"
+    folder.mkdir()
+    (folder / "commands.jsonl").write_text(
+        f'{{"schema":1,"stream":"commands","shape":"array","fields":[{fields}]}}\n{rows}'
+    )
+    desk = Desk(given=[])
+    context = SimpleNamespace(
+        name="agent-01",
+        tick_hz=10.0,
+        settings={"agents": str(tmp_path)},
+        delta_v=desk.note,
+        begin_answer=lambda: desk.given.append("another answer"),
+    )
+    software = RecordedCommands()
+    software.setup(context)
+
+    software.step(0.2, {})
+
+    answers = [
+        len(list(group))
+        for key, group in groupby(desk.given, lambda each: each != "another answer")
+        if key
+    ]
+    assert answers == [COMMANDS_PER_TICK_MAX, COMMANDS_PER_TICK_MAX, 40 - 2 * COMMANDS_PER_TICK_MAX]
 
 
 def test_recorded_estimates_are_given_again_with_what_was_believed_of_nothing(tmp_path):

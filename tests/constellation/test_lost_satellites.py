@@ -4,6 +4,7 @@ import pytest
 from constellation_fakes import Star, parameters, state_rows
 
 from madns_runtime.plugin.api import TimelineAction
+from madns_runtime.protocol.messages import Delivery
 from madns_runtime.simulations.constellation.actions import (
     LOSE_SATELLITE,
     TELECOMMAND,
@@ -71,6 +72,21 @@ def test_it_neither_flies_software_nor_measures_and_truth_goes_on(star):
     assert summary["while_lost"] == {"ticks": 10, "messages": 0}
     assert len(state_rows(star, "agent-02")) == len(state_rows(star, "agent-01")) == 30
     assert "while_lost" not in star.summaries()["agent-01"]
+
+
+def test_a_message_that_reaches_it_meanwhile_is_not_among_those_received(star):
+    mailbox = star.contexts["agent-02"].mailbox
+    star.run(10.0)
+    mailbox.add(Delivery("agent-01", 9.5, 10.0, "before"))
+    mailbox.add(Delivery("agent-01", 9.9, 12.0, "meanwhile"))
+    star.run(11.0, from_s=10.0)
+    star.host.begin_action(LOSS)
+    star.run(15.0, from_s=11.0)
+    summary = star.summaries()["agent-02"]
+
+    assert summary["while_lost"]["messages"] == 1
+    assert summary["flight"]["heard"] == ["agent-01 before"]
+    assert summary["messages_received"] == 1
 
 
 def test_two_losses_end_with_the_later_one_and_who_rejoins_is_told(star):

@@ -114,7 +114,7 @@ class ConstellationAgent(AgentSimulation):
         self._is_commanded = self._cockpit is not None or self._devices is not None
         self._phase_s = 0.0
         self._is_lost = False
-        self._ticks_lost = self._messages_lost = 0
+        self._ticks_lost = self._messages_lost = self._radio_lost = 0
         self._flight_tick = 0
         self._has_early_steps = self._cockpit is not None and self._rate.steps_per_tick > 1
         self._has_begun = False
@@ -145,7 +145,7 @@ class ConstellationAgent(AgentSimulation):
         if cockpit is not None:
             cockpit.phase_s = phase_s
             if self._has_early_steps:
-                self._step_early(index, cockpit)
+                self._step_early(index, t_s, cockpit)
         state = self._buffer.lookup(t_s)
         if state is not None:
             x, y, z = state[:3]
@@ -170,14 +170,14 @@ class ConstellationAgent(AgentSimulation):
         if self._stimuli is not None:
             self._stimuli.step(t_s)
 
-    def _step_early(self, tick: int, cockpit: Cockpit) -> None:
+    def _step_early(self, tick: int, tick_s: float, cockpit: Cockpit) -> None:
         """Do the steps of flight software since the tick before, but the one at the tick's own time."""
         has_begun, self._has_begun = self._has_begun, True
         # Who has just begun, or rejoined, was not there yet.
         for t_s in self._rate.early_times_s(tick) if has_begun else ():
             state = self._buffer.lookup(t_s)
             self._measure(tick, t_s, state)
-            cockpit.step(tick, t_s, state, is_early=True)
+            cockpit.step(tick, t_s, state, tick_s=tick_s)
 
     def _measure(self, tick: int, t_s: float, state: tuple[float, ...] | None) -> None:
         if self._sensors is not None:
@@ -244,6 +244,7 @@ class ConstellationAgent(AgentSimulation):
         """Take a message by radio; a broadcast also reaches those who fly nothing."""
         if self._is_lost:
             self._messages_lost += 1
+            self._radio_lost += delivery.sender != GROUND
         elif self._cockpit is not None:
             self._cockpit.deliver(delivery)
 
@@ -356,17 +357,19 @@ class ConstellationAgent(AgentSimulation):
         return {"while_lost": {"ticks": self._ticks_lost, "messages": self._messages_lost}}
 
     def _message_counts(self) -> dict[str, int]:
-        """Return the counts of messages by radio; without flight software nobody heard them."""
+        """Return the counts of messages by radio, as flight software heard them; without it nobody did."""
         counts = self._context.message_counts()
         if self._cockpit is None:
             return {
                 "messages_unheard": sum(counts[name] for name in ("received", "held", "no_room"))
             }
+        # What came in a tick is told in flight software's next step: at its own rate that is later, or never.
+        waiting, dropped = self._cockpit.unheard()
         return {
-            "messages_received": counts["received"],
-            "messages_held": counts["held"],
+            "messages_received": counts["received"] - waiting - dropped - self._radio_lost,
+            "messages_held": counts["held"] + waiting,
             "messages_late": counts["late"],
-            "messages_refused": counts["no_room"],
+            "messages_refused": counts["no_room"] + dropped,
             "messages_unheard": 0,
         }
 

@@ -133,6 +133,13 @@ class FlightContext(Protocol):
         """Log a sentence at critical, error, warning, info or debug."""
 
 
+class AnsweredContext(FlightContext, Protocol):
+    """The same as what stands in for software elsewhere sees it, whose answers to several ticks may come at once."""
+
+    def begin_answer(self) -> None:
+        """Take what comes from here on as that of another tick: by its bounds, and not beside what was said before."""
+
+
 class FlightSoftware(Protocol):
     """Flight software under test. Subclass it and override what is needed."""
 

@@ -19,7 +19,7 @@ from typing import Any
 from madns_runtime.errors import BlamedError
 from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.plugin.api import AgentContext
-from madns_runtime.simulations.constellation.flight.api import FlightContext, Readings
+from madns_runtime.simulations.constellation.flight.api import AnsweredContext, Readings
 from madns_runtime.simulations.constellation.flight.asked_ticks import AskedTick, AskedTicks
 from madns_runtime.simulations.constellation.flight.held_answers import held_answers
 from madns_runtime.simulations.constellation.flight.interface.answers import (
@@ -97,7 +97,7 @@ class ExternalFlight:
         self._clock_s = -math.inf
         """Time of its last record."""
 
-    def setup(self, context: FlightContext) -> None:
+    def setup(self, context: AnsweredContext) -> None:
         """
         Start the program, or begin to look for the software, and tell it who it is.
 
@@ -131,7 +131,7 @@ class ExternalFlight:
             self.abandon()  # nobody else knows yet that the program runs
             raise
 
-    def _introduce(self, context: FlightContext) -> None:
+    def _introduce(self, context: AnsweredContext) -> None:
         """Tell the software who it is."""
         settings = self._settings
         if self._is_recorded:

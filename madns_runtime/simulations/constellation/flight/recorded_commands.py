@@ -10,23 +10,22 @@ from typing import Any, Final
 from madns_runtime.errors import BlamedError
 from madns_runtime.recording.reader import read_stream
 from madns_runtime.simulations.constellation.flight.api import (
-    FlightContext,
-    FlightSoftware,
+    AnsweredContext,
     Readings,
 )
 
 DEVICES_FROM: Final = 2**30
 """Numbers from here on are commands of devices, which a rerun takes from the devices' records."""
 COMMANDS_MAX: Final = 16
-"""Of one step, as a vehicle takes them: of software that is faster than the ticks, the next steps of the tick give the others."""
+"""Of one answer, as a vehicle takes them: of more that were given in one tick, several answers had come."""
 TICK_TOLERANCE: Final = 1e-6
 """Rounding of times, in ticks."""
 
 
-class RecordedCommands(FlightSoftware):
+class RecordedCommands:
     """In the place of software that cannot be stepped; setting `agents`: folder of the run's agents."""
 
-    def setup(self, context: FlightContext) -> None:
+    def setup(self, context: AnsweredContext) -> None:
         """
         Read what was commanded and what was believed.
 
@@ -51,9 +50,9 @@ class RecordedCommands(FlightSoftware):
         tick = math.ceil(t_s * context.tick_hz - TICK_TOLERANCE)
         for row in self._believed.pop(tick, []):
             context.estimate({name: row[name] for name in row if name != "tick"})
-        rows = self._rows.get(tick, [])
-        given, rows[:] = rows[:COMMANDS_MAX], rows[COMMANDS_MAX:]
-        for row in given:
+        for number, row in enumerate(self._rows.pop(tick, [])):
+            if number and not number % COMMANDS_MAX:
+                context.begin_answer()
             vector, at_s = (row["x"], row["y"], row["z"]), row["at_s"]
             if row["kind"] == "delta_v":
                 context.delta_v(vector, at_s=at_s, frame=row["frame"])

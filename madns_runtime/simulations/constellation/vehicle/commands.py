@@ -65,6 +65,10 @@ class CommandDesk:
         self._tick, self._t_s, self._phase_s = tick, t_s, phase_s
         self._in_tick = 0
 
+    def begin_answer(self) -> None:
+        """Begin an answer to another tick, which may hold as many commands as any."""
+        self._in_tick = 0
+
     def delta_v(self, delta_v_m_s: Any, *, at_s: float, frame: str = "rtn") -> int:
         """
         Command a change of velocity and return the command's number.

@@ -100,7 +100,7 @@ class VehicleContext:
         self.delta_v, self.torque, self.ballistic = desk.delta_v, desk.torque, desk.ballistic
         self.dipole = desk.dipole
         self._tick: int | None = None
-        self._t_s = -math.inf
+        self._t_s = self._leaves_s = -math.inf
         self._messages = 0
         self._messages_in_tick = 0
         self.messages_sent = 0
@@ -114,10 +114,18 @@ class VehicleContext:
         if self._has_crosslinks or self._has_stations:
             context.open_stream("messages", streams.MESSAGES)
 
-    def begin(self, tick: int, t_s: float, phase_s: float) -> None:
-        """Begin a tick: from now on everything bears its time."""
+    def begin(
+        self, tick: int, t_s: float, phase_s: float, *, leaves_s: float | None = None
+    ) -> None:
+        """Begin a step: from now on everything bears its time, but messages the one at which they leave, where that is another."""
         self.desk.begin(tick, t_s, phase_s)
         self._tick, self._t_s = tick, t_s
+        self._leaves_s = t_s if leaves_s is None else leaves_s
+        self._messages_in_tick = 0
+
+    def begin_answer(self) -> None:
+        """Take what a program says from here on as its answer to another tick, whose bounds are its own."""
+        self.desk.begin_answer()
         self._messages_in_tick = 0
 
     # What flight software calls --------------------------------------------------------------
@@ -142,11 +150,12 @@ class VehicleContext:
         self._messages_in_tick += 1
         reason = self._why_refused(to, size)
         if reason is not None:
-            self.refuse(TransmissionRefusal(number, to, self._t_s, reason))
+            self.refuse(TransmissionRefusal(number, to, self._leaves_s, reason))
             return number
         self.messages_sent += 1
         self._context.transmit(to, payload, number=number)
-        self._context.record("messages", (self._tick, "sent", to, self._t_s, self._t_s, size))
+        row = (self._tick, "sent", to, self._leaves_s, self._leaves_s, size)
+        self._context.record("messages", row)
         return number
 
     def broadcast(self, payload: Any) -> int:

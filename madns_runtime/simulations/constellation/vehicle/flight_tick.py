@@ -35,6 +35,7 @@ from madns_runtime.simulations.constellation.flight.process import ExternalFligh
 from madns_runtime.simulations.constellation.flight_rates import FlightRate, flight_rate
 from madns_runtime.simulations.constellation.flight_settings import FlightClass, FlightRule
 from madns_runtime.simulations.constellation.messages import (
+    GROUND,
     CommandResult,
     Delivery,
     Initial,
@@ -95,6 +96,8 @@ class Cockpit:
         self._news: dict[str, deque[Reading]] = {}
         """Measurements since the step before."""
         self._news_dropped = self._messages_dropped = 0
+        self._radio_dropped = 0
+        """Of the messages dropped those that a radio brought."""
         self.phase_s = 0.0
         """By how much the vehicle's ticks lie behind their nominal times, s."""
         self.refuse = board.refuse
@@ -111,7 +114,7 @@ class Cockpit:
         t_s: float,
         state: tuple[float, ...] | None,
         *,
-        is_early: bool = False,
+        tick_s: float | None = None,
     ) -> None:
         """
         Do one step; one without truth has no readings, but flight software runs all the same.
@@ -120,14 +123,14 @@ class Cockpit:
             tick: Its number.
             t_s: Its time.
             state: Truth, or None.
-            is_early: Whether its time is before the tick's own: what came since the tick before is not told then,
-                but messages that had arrived by that time.
+            tick_s: The tick's own time where the step's is before it, else None: what came since the tick before is not
+                told then, but messages that had arrived by the step's time; and what it sends leaves at the tick's.
 
         Raises:
             BlamedError: Flight software raised.
         """
-        board = self._board
-        board.begin(tick, t_s, self.phase_s)
+        board, is_early = self._board, tick_s is not None
+        board.begin(tick, t_s, self.phase_s, leaves_s=tick_s)
         readings = self._read(t_s, state)
         # Most steps find nothing that came.
         if self._messages:
@@ -186,11 +189,16 @@ class Cockpit:
         return [one for one in messages if one.arrives_s <= until_s]
 
     def deliver(self, message: Delivery) -> None:
-        """Take a message by radio, to be told in the next step."""
+        """Take a message by radio, or a text that came by none, to be told in the next step."""
         if len(self._messages) >= MESSAGES_MAX:
-            self._messages.pop(0)
             self._messages_dropped += 1
+            self._radio_dropped += self._messages.pop(0).sender != GROUND
         self._messages.append(message)
+
+    def unheard(self) -> tuple[int, int]:
+        """Return how many messages by radio still wait for a step, and how many had no room to."""
+        waiting = sum(message.sender != GROUND for message in self._messages)
+        return waiting, self._radio_dropped
 
     def read_gauges(self, result: CommandResult) -> None:
         """Let the next step read the gauges of what a command has changed, and not before it has."""

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.plugin.context import clean_text
-from madns_runtime.simulations.constellation.flight.api import FlightContext
+from madns_runtime.simulations.constellation.flight.api import AnsweredContext
 
 TIME_TOLERANCE_S: Final = 1e-5
 """Of the time that an answer names, which may have been printed with six decimals."""
@@ -56,10 +56,10 @@ class FlightAnswer:
 
 
 def carry_out(
-    answer: FlightAnswer, context: FlightContext, program: str, *, t_s: float | None
+    answer: FlightAnswer, context: AnsweredContext, program: str, *, t_s: float | None
 ) -> None:
     """
-    Do what an answer asks for.
+    Do what an answer asks for; where those to several ticks come at once, each may ask for what a tick may.
 
     Args:
         answer: Whole, from a protocol.
@@ -75,6 +75,8 @@ def carry_out(
             raise PluginError(answer.fault)
         if None not in (t_s, answer.t_s) and abs(answer.t_s - t_s) > TIME_TOLERANCE_S:
             raise PluginError(f"expected the answer to the tick at {t_s:g} s, got {answer.t_s!r}")
+        if t_s is not None:
+            context.begin_answer()
         for command in answer.commands:
             _command(command, context)
         for to, payload in answer.sends:
@@ -88,7 +90,7 @@ def carry_out(
         raise BlamedError(f"{program}: {error}{wrote}") from error
 
 
-def _command(command: CommandRequest, context: FlightContext) -> None:
+def _command(command: CommandRequest, context: AnsweredContext) -> None:
     value, at_s = command.value, command.at_s
     if command.kind == "delta_v":
         context.delta_v(value, at_s=at_s, frame=command.frame)
