@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from numbers import Integral, Real
 from pathlib import Path, PurePath
@@ -267,6 +267,13 @@ def _is_fixed(value: Any, parts: dict[int, Any]) -> bool:
 def is_line(value: object) -> TypeGuard[str]:
     """Tell whether a value is one line of printable text, at most LINE_CHARACTERS_MAX long: every file can hold it."""
     return isinstance(value, str) and len(value) <= LINE_CHARACTERS_MAX and value.isprintable()
+
+
+def first_few(texts: Sequence[str], most: int, separator: str = ", ") -> str:
+    """Return the first of some texts in a line, and how many more there are: "a, b and 3 more", or "a; b; and 3 more"."""
+    more = len(texts) - most
+    ending = f"{separator.replace(', ', ' ')}and {more} more" if more > 0 else ""
+    return separator.join(texts[:most]) + ending
 
 
 def shown(value: object) -> str:

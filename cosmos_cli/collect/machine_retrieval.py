@@ -19,6 +19,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Answer, Helper
 from cosmos_cli.onboard.records import FILES_MAX, entry_line
 from cosmos_cli.ui.plural import counted
+from madns_runtime.plain_values import first_few
 
 ROUNDS_MAX = 3
 """So often a machine's files are listed anew when they changed on the way."""
@@ -327,11 +328,9 @@ class MachineRetrieval:
         return faults
 
     def _refusal(self, faults: Sequence[str]) -> MachineFailure:
-        rest = len(faults) - FAULTS_SHOWN_MAX
-        more = f"; and {rest} more" if rest > 0 else ""
         return RecordsKept(
             FailureKind.DATA,
-            f"{len(faults)} of its files cannot come: {'; '.join(faults[:FAULTS_SHOWN_MAX])}{more}",
+            f"{len(faults)} of its files cannot come: {first_few(faults, FAULTS_SHOWN_MAX, '; ')}",
             f"all of it is kept there, see {self._source.directory}",
         )
 

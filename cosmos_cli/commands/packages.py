@@ -32,6 +32,7 @@ from cosmos_cli.fleet.target import require_root
 from cosmos_cli.onboard.apt_words import PYTHON_HINT
 from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
+from madns_runtime.plain_values import first_few
 
 PARTS = ("files", "links", "facts", "scratch", "system", "apt_words", "apt")
 PIECE_TIMEOUT_S = 60.0
@@ -178,10 +179,8 @@ def _words(outcome: Outcome[Changed]) -> str:
     done = outcome.value
     if done is None:
         return f"failed   {outcome.failure}"
-    told = [_change_words(change) for change in done["changes"][:NAMES_SHOWN_MAX]]
-    more = len(done["changes"]) - len(told)
-    changes = ", ".join(told) + (f" and {more} more" if more > 0 else "")
-    status = f"changed  {changes}" if told else "ok"
+    changes = first_few([_change_words(change) for change in done["changes"]], NAMES_SHOWN_MAX)
+    status = f"changed  {changes}" if changes else "ok"
     notes = "; ".join(done["notes"])
     return f"{status}  ({notes})" if notes else status
 

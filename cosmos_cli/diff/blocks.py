@@ -10,6 +10,7 @@ from cosmos_cli.diff.stream import Alone, By, StreamDifference
 from cosmos_cli.ui.name_ranges import names_by
 from cosmos_cli.ui.plural import counted
 from madns_runtime.analysis.values import Heading, ReportRemark, TableBlock
+from madns_runtime.plain_values import first_few
 
 KEYS_SHOWN_MAX = 40
 AGENTS_SHOWN_MAX = 12
@@ -55,7 +56,9 @@ def blocks_of(found: Comparison) -> Iterator[TableBlock | ReportRemark]:
         yield ReportRemark(text=line)
     for name, streams in (("A", found.only_a), ("B", found.only_b)):
         for table, sources in names_by(streams).items():
-            yield ReportRemark(text=f"only in {name}: {table} of {_listed(sources)}")
+            yield ReportRemark(
+                text=f"only in {name}: {table} of {first_few(sources, AGENTS_SHOWN_MAX)}"
+            )
 
 
 def _keys_table(title: str, keys: Sequence[KeyDifference]) -> TableBlock:
@@ -124,7 +127,9 @@ def _alone_lines(totals: Sequence[StreamDifference]) -> list[str]:
                 lines.append(f"{total.table}: {_told_alone(alone, total.by)} only in {name}")
         for name, fields in (("A", total.fields_only_a), ("B", total.fields_only_b)):
             if fields:
-                lines.append(f"{total.table}: {_listed(fields)} only recorded in {name}")
+                lines.append(
+                    f"{total.table}: {first_few(fields, AGENTS_SHOWN_MAX)} only recorded in {name}"
+                )
     return lines
 
 
@@ -134,15 +139,6 @@ def _told_alone(alone: Alone, by: By) -> str:
     if alone.count == 1:
         return f"1 record ({first})"
     return f"{alone.count} records ({first} to {last})"
-
-
-def _listed(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:AGENTS_SHOWN_MAX])
-    return (
-        shown
-        if len(names) <= AGENTS_SHOWN_MAX
-        else f"{shown} and {len(names) - AGENTS_SHOWN_MAX} more"
-    )
 
 
 def _short(value: object) -> str:

@@ -17,6 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cosmos_cli.evidence.streams import Kind
+from madns_runtime.plain_values import is_real
 from madns_runtime.recording.columns import column_of
 
 ARROW_TYPES: dict[Kind, pa.DataType] = {
@@ -143,12 +144,8 @@ def as_floats(values: NDArray[Any]) -> NDArray[np.float64]:
     """Return a column as floats; what is no number is NaN."""
     if values.dtype.kind in "fi":
         return values.astype(np.float64)
-    numbers = [v if _is_number(v) else np.nan for v in values.tolist()]
+    numbers = [v if is_real(v) else np.nan for v in values.tolist()]
     return np.array(numbers, dtype=np.float64)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _convert_each(values: list[Any], kind: Kind) -> tuple[pa.Array, int]:
@@ -161,9 +158,9 @@ def _convert(value: Any, kind: Kind) -> Any:
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return None
     if kind == "float":
-        return float(value) if _is_number(value) else None
+        return float(value) if is_real(value) else None
     if kind == "int":
-        is_int64 = _is_number(value) and value == int(value) and -(2**63) <= value < 2**63
+        is_int64 = is_real(value) and value == int(value) and -(2**63) <= value < 2**63
         return int(value) if is_int64 else None
     if kind == "bool":
         return value if isinstance(value, bool) else None

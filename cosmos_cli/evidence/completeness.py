@@ -12,6 +12,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import INCARNATION_MAX, StreamScan
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.config import RunConfig
+from madns_runtime.plain_values import first_few
 from madns_runtime.plain_values import mapping_at as mapping_at
 from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS, TICKS
 
@@ -220,14 +221,9 @@ def _reasons(agents: Mapping[str, Any]) -> dict[str, str]:
 
 def _line(name: str, faults: Sequence[str], cause: str | None) -> str:
     """Say what is missing of a source, and first what happened to it if that is known."""
-    return f"{name}: {f'{cause}: ' if cause else ''}{_listed(faults)}"
+    return f"{name}: {f'{cause}: ' if cause else ''}{first_few(faults, FAULTS_SHOWN_MAX)}"
 
 
 def _told(scan: StreamScan) -> str:
     life = f" of incarnation {scan.file.incarnation}" if scan.file.incarnation > 1 else ""
     return f"{scan.file.stream}{life} {scan.fault}"
-
-
-def _listed(items: Sequence[str]) -> str:
-    rest = len(items) - FAULTS_SHOWN_MAX
-    return ", ".join(items[:FAULTS_SHOWN_MAX]) + (f" and {rest} more" if rest > 0 else "")

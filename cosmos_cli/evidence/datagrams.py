@@ -50,8 +50,8 @@ def packet_counts(
         agents: The host's result by agent: "messages" of its link, "simulation" as it summed up.
         faults: Its account of the messages that inserted faults were shown, by agent.
 
-    An agent that died summed nothing up, and one that came back its last life alone: of them what the link lost and what a
-    fault took is told, None if the link counted nothing. A packet that came behind a newer one counts as out of order, and as lost too, for it never reached the simulation.
+    An agent that was lost summed nothing up, and one that came back only its last incarnation: for both it is what the
+    link lost and what a fault took, None if the link counted nothing. A packet that came behind a newer one counts as out of order, and as lost too, for it never reached the simulation.
     """
     own = {name: mapping_at(agents, name, "simulation") for name in agents}
     used = {

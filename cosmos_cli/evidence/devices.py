@@ -19,7 +19,7 @@ from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.records import DEVICE_LOSSES
 
 ACCOUNT_NAME = re.compile(r"devices(?:\.([1-9][0-9]{0,8}))?\.json")
-"""Accounts of a machine's devices, below machines/<machine>/: one per life of its supervisor."""
+"""Accounts of a machine's devices, below machines/<machine>/: one per incarnation of its supervisor."""
 NO_REPORT = "unknown"
 """Status of a device that nobody has given account of."""
 WHY_MISSING = "no account of it: its supervisor did not come to its end"
@@ -56,15 +56,16 @@ def read_devices(
     run: RunDirectory, plan: Mapping[str, Any], result: Mapping[str, Any] | None
 ) -> dict[str, dict[str, Any]]:
     """Return what became of each device, by its full name; of one without an account, that there is none."""
-    lives: dict[str, int] = {}
+    incarnations: dict[str, int] = {}
     for machine, names in mapping_at(plan, "devices").items():
         accounts = _accounts(run.path / "machines" / str(machine))
         for name in names if isinstance(names, list) else ():
-            lives[str(name)] = max(accounts, default=0)
+            incarnations[str(name)] = max(accounts, default=0)
     found = _told(run, plan, result)
     names = dict.fromkeys((*expected_devices(plan), *found))
     return {
-        clean_line(name): _joined(found.get(name, ()), lives.get(name, 0)) for name in sorted(names)
+        clean_line(name): _joined(found.get(name, ()), incarnations.get(name, 0))
+        for name in sorted(names)
     }
 
 
@@ -87,7 +88,7 @@ def recorded_files(
 def _told(
     run: RunDirectory, plan: Mapping[str, Any], result: Mapping[str, Any] | None
 ) -> dict[str, list[Mapping[str, Any]]]:
-    """Return all accounts of each device, by its full name: of its machine's lives, or in lockstep of the host."""
+    """Return all accounts of each device, by its full name: of its machine's incarnations, or in lockstep of the host."""
     found: dict[str, list[Mapping[str, Any]]] = {}
     for machine in mapping_at(plan, "devices"):
         for account in _accounts(run.path / "machines" / str(machine)).values():
@@ -239,7 +240,7 @@ def _check(
 
 
 def _accounts(folder: Path) -> dict[int, Mapping[str, Any]]:
-    """Return a machine's accounts by life; one that cannot be read is as good as none."""
+    """Return a machine's accounts by incarnation; one that cannot be read is as good as none."""
     found: dict[int, Mapping[str, Any]] = {}
     for path in sorted(folder.glob("devices*.json")):
         named = ACCOUNT_NAME.fullmatch(path.name)
@@ -252,8 +253,8 @@ def _accounts(folder: Path) -> dict[int, Mapping[str, Any]]:
     return dict(sorted(found.items()))
 
 
-def _joined(told: Sequence[Mapping[str, Any]], lives: int) -> dict[str, Any]:
-    """Return the account of one device over all lives; a life without one counts as a loss."""
+def _joined(told: Sequence[Mapping[str, Any]], incarnations: int) -> dict[str, Any]:
+    """Return the account of one device over all incarnations; one without it counts as a loss."""
     if not told:
         missing = dict.fromkeys(
             ("samples", "errors", "stale_ratio", "lost", "restarts", "frozen"), None
@@ -268,7 +269,7 @@ def _joined(told: Sequence[Mapping[str, Any]], lives: int) -> dict[str, Any]:
         "samples": _sum(flat, "samples"),
         "errors": _sum(flat, "errors"),
         "stale_ratio": max(numbers) if len(numbers) == len(flat) else None,
-        "lost": None if lost is None else lost + max(lives - len(told), 0),
+        "lost": None if lost is None else lost + max(incarnations - len(told), 0),
         "restarts": _sum(flat, "restarts"),
         "frozen": _frozen(flat),
         "unsafe": int(any(each.get("unsafe") for each in flat[-1:])),
@@ -280,7 +281,7 @@ def _joined(told: Sequence[Mapping[str, Any]], lives: int) -> dict[str, Any]:
 
 
 def _stimulus(told: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return counts of points by output over all lives, and the largest of each life's figures of lateness."""
+    """Return counts of points by output over all incarnations, and the largest of each one's figures of lateness."""
     found: dict[str, dict[str, Any]] = {}
     for each in told:
         for channel, counts in mapping_at(each, "stimulus").items():
@@ -298,7 +299,7 @@ def _stimulus(told: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def _silent_inputs(told: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the inputs that gave nothing in any life of a device that gave samples."""
+    """Return the inputs that gave nothing in any incarnation of a device that gave samples."""
     if not _sum(told, "samples"):
         return []
     lists = [each.get("silent_inputs") for each in told]

@@ -109,7 +109,7 @@ class Evidence:
         summaries = self._of_agents("ticks")
         for name, ticks in summaries.items():
             own = told_causes(ticks)
-            # A restarted agent's summary is of its last life alone; its records are of all.
+            # A restarted agent's summary is of its last incarnation alone; its records are of all.
             if own is not None and not self._is_restarted(name):
                 told[name] = own
         if not told and totals.missed:

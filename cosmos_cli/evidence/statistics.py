@@ -177,7 +177,7 @@ def tick_totals(
     for name in agents:
         own, seen = counters.get(name, {}), recorded.get(name)
         seen_run, seen_missed = (seen.run, seen.missed) if seen else (0, 0)
-        # A summary is of the last life alone; records are of all.
+        # A summary is of the last incarnation alone; records are of all.
         seen_overruns = seen.overrun_errors if seen else 0
         totals[name] = TickTotals(
             due=max(_due(own, due_each, is_excused=name in excused), seen_run + seen_missed),

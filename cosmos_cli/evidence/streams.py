@@ -42,7 +42,7 @@ Consumer = Callable[[Columns, int], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordFile:
-    """One file of one stream: who recorded it, in which life of the process, and its fields."""
+    """One file of one stream: who recorded it, in which incarnation of the process, and its fields."""
 
     path: Path
     role: Role

@@ -199,7 +199,7 @@ class TableWriter:
         incarnation = np.full(count, file.incarnation, np.int32)
         arrays: list[Any] = [one_code(file.source, count), numbers_array(incarnation)]
         joined = {
-            field.name: _join([batch.get(field.name) for batch in self._held], self._held, count)
+            field.name: _join([batch.get(field.name) for batch in self._held], count)
             for field in layout.fields
         }
         t_s = joined.get(TIME)
@@ -392,7 +392,7 @@ def _field(column: pa.Field) -> Field:
     )
 
 
-def _join(parts: list[NDArray[Any] | None], held: list[Columns], count: int) -> NDArray[Any]:
+def _join(parts: list[NDArray[Any] | None], count: int) -> NDArray[Any]:
     """Return one column of all held batches; a field that an incarnation lacks is null."""
     whole = [part for part in parts if part is not None]
     if len(whole) < len(parts):

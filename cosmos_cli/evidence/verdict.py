@@ -15,7 +15,7 @@ from typing import Any, TypeGuard
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.ui.plural import counted
 from madns_runtime.conditions.reports import BROKEN
-from madns_runtime.plain_values import mapping_at
+from madns_runtime.plain_values import first_few, mapping_at
 
 OF_TICKS = "deadline."
 """Begins the names of the checks that late and missed ticks break."""
@@ -372,6 +372,4 @@ def _told(check: CheckResult) -> str:
 
 
 def _listed(items: Sequence[str], shown_max: int = 3) -> str:
-    rest = len(items) - shown_max
-    more = f"; and {rest} more" if rest > 0 else ""
-    return "; ".join(first_line(item) for item in items[:shown_max]) + more
+    return first_few([first_line(item) for item in items], shown_max, "; ")

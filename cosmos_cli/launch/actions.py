@@ -30,7 +30,7 @@ class StartAgents:
 
     @property
     def name(self) -> str:
-        """The supervisor's name; of a machine that has returned, with the number of its life."""
+        """The supervisor's name; of a machine that has returned, with the number of its incarnation."""
         return f"agents@{self.machine}" + (f" ({self.life.number})" if self.life.number > 1 else "")
 
 

@@ -57,7 +57,7 @@ BACKGROUND_END_S = 10.0
 """For what machines are still being asked when the run is over."""
 CLEAN_S = 3.0
 FORCED_S = 3.0
-"""For what a lost machine's earlier life has left there."""
+"""For what a lost machine's earlier incarnation has left there."""
 NO_MACHINES: Mapping[str, RemoteMachine] = {}
 
 _boot_s = partial(time.clock_gettime, getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))

@@ -254,9 +254,9 @@ class Supervision:
         if child.name != HOST:
             self._supervisor_exited(child, event.how)
         elif not self._has_host_finished and not self._is_closing:
-            self._host_exited(child, event)
+            self._host_exited(event)
 
-    def _host_exited(self, child: ChildRecord, event: happened.ChildExited) -> None:
+    def _host_exited(self, event: happened.ChildExited) -> None:
         """Judge a host that ended without a word of its result: too long for a line, or cut off."""
         if event.result is not None and event.code in HOST_EXIT_CODES:
             self._host_finished(event.result)

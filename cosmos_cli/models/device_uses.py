@@ -12,6 +12,7 @@ from cosmos_cli.models.fault_place import fault_found_at
 from cosmos_cli.models.scenario import Scenario
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.units import unit_fault
+from madns_runtime.plain_values import first_few
 from madns_runtime.plugin.api import DeviceUse
 
 AGENTS_NAMED_MAX = 3
@@ -96,6 +97,4 @@ def _channel_faults(use: DeviceUse, channel: Channel) -> Iterator[str]:
 
 def named_agents(agents: Sequence[str]) -> str:
     """Return the first of some agents' names, and how many more there are."""
-    more = len(agents) - AGENTS_NAMED_MAX
-    named = ", ".join(agents[:AGENTS_NAMED_MAX])
-    return f"{named} and {more} more" if more > 0 else named
+    return first_few(agents, AGENTS_NAMED_MAX)

@@ -22,6 +22,7 @@ from cosmos_cli.errors import FAULTS_SHOWN_MAX, InputError
 from cosmos_cli.models.document import did_you_mean, may_guess
 from cosmos_cli.models.limit_file import MARK, file_patterns, has_stray_bracket, pieces_of
 from cosmos_cli.models.text_forms import compile_expression
+from madns_runtime.plain_values import first_few
 
 if TYPE_CHECKING:
     from cosmos_cli.models.inventory.machine import Machine
@@ -85,7 +86,7 @@ def _matching(
         if piece[0] == "!":
             added.difference_update(matcher.names(piece[1:]))
     if matcher.faults:
-        raise PatternError(_listed(list(dict.fromkeys(matcher.faults))))
+        raise PatternError(first_few(list(dict.fromkeys(matcher.faults)), FAULTS_SHOWN_MAX, "; "))
     if not added:
         raise PatternError(f"means no machine; there are {_some(m.name for m in machines)}")
     return tuple(machine for machine in machines if machine.name in added)
@@ -231,12 +232,6 @@ class _Matcher:
 
     def _may_guess(self) -> bool:
         return may_guess(len(self.faults), len(self.groups) + len(self.machines))
-
-
-def _listed(faults: Sequence[str]) -> str:
-    """Return the first faults in a line, and how many more there are."""
-    more = len(faults) - FAULTS_SHOWN_MAX
-    return "; ".join(faults[:FAULTS_SHOWN_MAX]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _is_glob(text: str) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 from cosmos_cli.onboard.request_loop import HelperRefusal, last_words
 
@@ -48,112 +49,6 @@ PYTHON_HINT = (
     "a Python package belongs into `requirements` of the scenario or `cosmos_requirements` of the"
     " inventory, then `cosmos up`"
 )
-_TROUBLES = (
-    (
-        "locked",
-        re.compile(r"Could not get lock|is another process using it|was locked by another process"),
-        "another program works on packages there",
-        "wait for its end, then repeat; a board often updates itself after it was started",
-    ),
-    (
-        "disk_full",
-        _FULL,
-        "not enough free space",
-        "make room there (`cosmos exec --sudo -- apt-get clean`, `cosmos wipe`), then repeat",
-    ),
-    (
-        "unknown",
-        _UNKNOWN,
-        "its package sources have no",
-        "check the spelling, and the sources in /etc/apt there; " + PYTHON_HINT,
-    ),
-    (
-        "no_way",
-        re.compile(rf"{_NO_WAY.pattern}|Network is unreachable|Connection timed out"),
-        "no way from there to its package source",
-        "boards without internet need a mirror, a proxy (Acquire::http::Proxy in"
-        " /etc/apt/apt.conf.d) or a local repository that they can reach",
-    ),
-    (
-        "interrupted",
-        re.compile(r"dpkg was interrupted"),
-        "an earlier installation was interrupted there",
-        "`cosmos exec --sudo -- dpkg --configure -a` finishes it",
-    ),
-    (
-        "read_only",
-        re.compile(r"Read-only file system"),
-        "its disk is read-only",
-        "check the card or disk there (a worn SD card turns read-only)",
-    ),
-    (
-        "clock",
-        re.compile(r"is not valid yet|[Rr]elease file .* is expired"),
-        "its clock and its package source disagree about the date",
-        "set the clock there: `cosmos doctor` tells how far it is off",
-    ),
-    (
-        "unsigned",
-        re.compile(r"NO_PUBKEY|is not signed|couldn't be verified"),
-        "its package source is not signed by a key that it trusts",
-        "add the key of that source there, or take the source out of /etc/apt",
-    ),
-    (
-        "stale",
-        re.compile(r"404 +Not Found|File has unexpected size|Hash Sum mismatch"),
-        "its package source no longer has what its lists name",
-        "repeat the command later: the source may be changing right now",
-    ),
-    (
-        "sources",
-        re.compile(r"The list of sources could not be read|Malformed (?:entry|line|stanza)"),
-        "its list of package sources cannot be read",
-        "check /etc/apt/sources.list and /etc/apt/sources.list.d there",
-    ),
-    (
-        "broken",
-        re.compile(r"fix-broken"),
-        "packages there do not fit together",
-        "`cosmos exec --sudo -- apt-get --fix-broken install --yes` may mend it",
-    ),
-    (
-        "unmet",
-        re.compile(r"[Uu]nmet dependencies|held (?:broken )?packages"),
-        "what is asked does not fit the packages there",
-        "others that need it, or that it needs, are in the way; `cosmos exec -- apt-mark showhold` names"
-        " what is held there",
-    ),
-    (
-        "essential",
-        re.compile(r"[Ee]ssential packages|should NOT be done|[Pp]rotected packages"),
-        "apt will not remove what the system itself needs",
-        "leave that package installed",
-    ),
-    (
-        "not_root",
-        re.compile(r"are you root\?|Permission denied"),
-        "apt may not change packages there",
-        "this needs root: let the user run sudo without a password",
-    ),
-)
-_KINDS = {
-    "locked": "busy",
-    "disk_full": "disk_full",
-    "read_only": "read_only",
-    "not_root": "no_sudo",
-}
-"""Kinds of refusal that say more than that a step failed."""
-
-
-def trouble_of(output: str) -> Trouble:
-    """Return what went wrong, from what apt or dpkg said."""
-    for word, pattern, text, advice in _TROUBLES:
-        if pattern.search(output):
-            detail = _DETAILS[word](output) if word in _DETAILS else ""
-            kind = _KINDS.get(word, "step")
-            return Trouble(word=word, kind=kind, text=text + detail, advice=advice)
-    said = last_words(output.encode()) or "it said nothing"
-    return Trouble(word="other", kind="step", text=f"apt failed: {said}")
 
 
 def _holder(output: str) -> str:
@@ -188,15 +83,129 @@ def _source(output: str) -> str:
     return f" {where}" if where else ""
 
 
-_DETAILS: Mapping[str, Callable[[str], str]] = {
-    "locked": _holder,
-    "disk_full": _full_folder,
-    "unknown": _unknown_names,
-    "no_way": _source,
-    "broken": _first_unmet,
-    "unmet": _first_unmet,
-}
-"""By trouble: returns its details from the output."""
+class _Symptom(NamedTuple):
+    """Words of apt and dpkg by which a trouble is known, and what is told of it."""
+
+    word: str
+    """Name of the trouble."""
+    pattern: re.Pattern[str]
+    text: str
+    advice: str
+    kind: str = "step"
+    """Of the refusal; most say no more than that a step failed."""
+    details: Callable[[str], str] | None = None
+    """Returns what follows the text, from all that was said."""
+
+
+_SYMPTOMS = (
+    _Symptom(
+        "locked",
+        re.compile(r"Could not get lock|is another process using it|was locked by another process"),
+        "another program works on packages there",
+        "wait for its end, then repeat; a board often updates itself after it was started",
+        kind="busy",
+        details=_holder,
+    ),
+    _Symptom(
+        "disk_full",
+        _FULL,
+        "not enough free space",
+        "make room there (`cosmos exec --sudo -- apt-get clean`, `cosmos wipe`), then repeat",
+        kind="disk_full",
+        details=_full_folder,
+    ),
+    _Symptom(
+        "unknown",
+        _UNKNOWN,
+        "its package sources have no",
+        "check the spelling, and the sources in /etc/apt there; " + PYTHON_HINT,
+        details=_unknown_names,
+    ),
+    _Symptom(
+        "no_way",
+        re.compile(rf"{_NO_WAY.pattern}|Network is unreachable|Connection timed out"),
+        "no way from there to its package source",
+        "boards without internet need a mirror, a proxy (Acquire::http::Proxy in"
+        " /etc/apt/apt.conf.d) or a local repository that they can reach",
+        details=_source,
+    ),
+    _Symptom(
+        "interrupted",
+        re.compile(r"dpkg was interrupted"),
+        "an earlier installation was interrupted there",
+        "`cosmos exec --sudo -- dpkg --configure -a` finishes it",
+    ),
+    _Symptom(
+        "read_only",
+        re.compile(r"Read-only file system"),
+        "its disk is read-only",
+        "check the card or disk there (a worn SD card turns read-only)",
+        kind="read_only",
+    ),
+    _Symptom(
+        "clock",
+        re.compile(r"is not valid yet|[Rr]elease file .* is expired"),
+        "its clock and its package source disagree about the date",
+        "set the clock there: `cosmos doctor` tells how far it is off",
+    ),
+    _Symptom(
+        "unsigned",
+        re.compile(r"NO_PUBKEY|is not signed|couldn't be verified"),
+        "its package source is not signed by a key that it trusts",
+        "add the key of that source there, or take the source out of /etc/apt",
+    ),
+    _Symptom(
+        "stale",
+        re.compile(r"404 +Not Found|File has unexpected size|Hash Sum mismatch"),
+        "its package source no longer has what its lists name",
+        "repeat the command later: the source may be changing right now",
+    ),
+    _Symptom(
+        "sources",
+        re.compile(r"The list of sources could not be read|Malformed (?:entry|line|stanza)"),
+        "its list of package sources cannot be read",
+        "check /etc/apt/sources.list and /etc/apt/sources.list.d there",
+    ),
+    _Symptom(
+        "broken",
+        re.compile(r"fix-broken"),
+        "packages there do not fit together",
+        "`cosmos exec --sudo -- apt-get --fix-broken install --yes` may mend it",
+        details=_first_unmet,
+    ),
+    _Symptom(
+        "unmet",
+        re.compile(r"[Uu]nmet dependencies|held (?:broken )?packages"),
+        "what is asked does not fit the packages there",
+        "others that need it, or that it needs, are in the way; `cosmos exec -- apt-mark showhold` names"
+        " what is held there",
+        details=_first_unmet,
+    ),
+    _Symptom(
+        "essential",
+        re.compile(r"[Ee]ssential packages|should NOT be done|[Pp]rotected packages"),
+        "apt will not remove what the system itself needs",
+        "leave that package installed",
+    ),
+    _Symptom(
+        "not_root",
+        re.compile(r"are you root\?|Permission denied"),
+        "apt may not change packages there",
+        "this needs root: let the user run sudo without a password",
+        kind="no_sudo",
+    ),
+)
+"""In the order in which they are looked for: the first that is met is told."""
+
+
+def trouble_of(output: str) -> Trouble:
+    """Return what went wrong, from what apt or dpkg said."""
+    for known in _SYMPTOMS:
+        if known.pattern.search(output):
+            text = known.text + (known.details(output) if known.details else "")
+            return Trouble(word=known.word, kind=known.kind, text=text, advice=known.advice)
+    said = last_words(output.encode()) or "it said nothing"
+    return Trouble(word="other", kind="step", text=f"apt failed: {said}")
 
 
 def planned_changes(output: str) -> Changes:

@@ -18,6 +18,7 @@ from cosmos_cli.provision.environment import installed_request
 from cosmos_cli.provision.inventory_steps import declared_steps, package_step
 from cosmos_cli.provision.settings import setting_steps
 from cosmos_cli.provision.step import Kind, Step, StepRequest
+from madns_runtime.plain_values import first_few
 
 RESERVE_BYTES = 16_000_000
 """Bytes that any plan leaves free on a machine's disk: records of a run, and the system's own needs."""
@@ -80,9 +81,7 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
         )
     rooted = [step.title for step in steps if step.needs_root]
     if rooted and facts.can_become_root is False:
-        shown = "; ".join(rooted[:TITLES_SHOWN_MAX])
-        more = len(rooted) - TITLES_SHOWN_MAX
-        shown += f"; and {more} more" if more > 0 else ""
+        shown = first_few(rooted, TITLES_SHOWN_MAX, "; ")
         why, cure = _root_refusal(facts)
         raise MachineFailure(FailureKind.NO_SUDO, f"{why}, which is needed for: {shown}", cure)
 

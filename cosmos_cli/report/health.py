@@ -17,6 +17,7 @@ from madns_runtime.analysis.values import (
     TableBlock,
     headings,
 )
+from madns_runtime.plain_values import first_few
 
 CPU, TEMPERATURE = "cpu_percent", "core_temperature_c"
 BYTES_PER_MB = 1e6
@@ -79,11 +80,12 @@ def _temperature(table: RecordedTable, run: RecordedRun) -> list[Block]:
     if len(without) < len(table.sources):
         blocks += _quantity(table, run, TEMPERATURE, f"Core temperature {_whose(table)}", "°C")
     if without:
-        shown = ", ".join(without[:8]) + (
-            f" and {len(without) - 8} more" if len(without) > 8 else ""
-        )
         verb = "has" if len(without) == 1 else "have"
-        blocks.append(ReportRemark(text=f"{shown} {verb} no temperature sensor: nothing to draw."))
+        blocks.append(
+            ReportRemark(
+                text=f"{first_few(without, 8)} {verb} no temperature sensor: nothing to draw."
+            )
+        )
     return blocks
 
 

@@ -24,6 +24,7 @@ from madns_runtime.analysis.values import (
     TableBlock,
 )
 from madns_runtime.bounded_files import open_regular_file
+from madns_runtime.plain_values import first_few
 from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED
 from madns_runtime.units import conversion
 
@@ -62,9 +63,7 @@ class ActionTold:
     @property
     def whom(self) -> str:
         """Its agents."""
-        shown = ", ".join(map(str, self.agents[:AGENTS_TOLD_MAX]))
-        more = len(self.agents) - AGENTS_TOLD_MAX
-        return f"{shown} and {more} more" if more > 0 else shown
+        return first_few([str(agent) for agent in self.agents], AGENTS_TOLD_MAX)
 
 
 def read_actions(run: RunDirectory) -> list[ActionTold]:

@@ -23,6 +23,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory, installed_versions
 from cosmos_cli.launch.flown_copy import hashed_file, names_in
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.bounded_files import read_regular_file
+from madns_runtime.plain_values import first_few
 from madns_runtime.plugin.registry import is_file, is_shipped
 
 SHOWN_MAX: Final = 20
@@ -93,8 +94,7 @@ def _fill(run: RunDirectory, flown: FlownFiles, folder: Path, today: Path | None
             f"{folder}: cannot put the copy there: {error.strerror or error}"
         ) from error
     if faults:
-        more = len(faults) - SHOWN_MAX
-        told = "; ".join(faults[:SHOWN_MAX]) + (f"; and {more} more" if more > 0 else "")
+        told = first_few(faults, SHOWN_MAX, "; ")
         raise InputError(f"{run.name}: its copy cannot be flown: {told}; {OTHERWISE}")
 
 
@@ -146,9 +146,7 @@ def software_remarks(run: RunDirectory, folder: Path, which: str) -> tuple[str, 
         )
     differing = differing_files(flown, folder)
     if differing:
-        more = len(differing) - SHOWN_MAX
-        told = ", ".join(differing[:SHOWN_MAX]) + (f" and {more} more" if more > 0 else "")
-        found.append(f"{which} flight software differs: {told}")
+        found.append(f"{which} flight software differs: {first_few(differing, SHOWN_MAX)}")
     return tuple(found)
 
 

@@ -19,7 +19,7 @@ from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.kinds.playback import streams_of
-from madns_runtime.plain_values import mapping_at
+from madns_runtime.plain_values import first_few, mapping_at
 from madns_runtime.recording.reader import read_stream
 from madns_runtime.timing.rate import count_ticks
 
@@ -121,8 +121,7 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None) -
         faults.append("every agent was killed before any of its ticks was written")
     devices = tuple(_devices(run, config, plan, faults))
     if faults:
-        more = len(faults) - FAULTS_SHOWN_MAX
-        told = "; ".join(faults[:FAULTS_SHOWN_MAX]) + (f"; and {more} more" if more > 0 else "")
+        told = first_few(faults, FAULTS_SHOWN_MAX, "; ")
         raise InputError(f"{run.name} cannot be flown again: {told}")
     status = (run.read_json(run.run_json) or {}).get("status")
     is_cut_off = not config.time.is_lockstep and status != "complete"

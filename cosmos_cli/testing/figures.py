@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, TypeGuard, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from cosmos_cli.testing.check_lines import shown
 from madns_runtime.analysis.distribution import Distribution
 from madns_runtime.analysis.sampling import as_array
 from madns_runtime.conditions.condition import HOST, ValueBounds
+from madns_runtime.plain_values import is_real
 
 ROWS_MAX = 200_000
 """Records that are read at a time."""
@@ -44,7 +45,7 @@ class ComparedFigure:
         """Whether what came is what is expected, within the tolerance; texts and truth values are the same or not."""
         if self.expected is None or self.got is None:
             return False
-        if _is_number(self.expected) and _is_number(self.got):
+        if is_real(self.expected) and is_real(self.got):
             return ValueBounds.equals(self.expected, self.allowed).holds(self.got)
         return type(self.expected) is type(self.got) and self.expected == self.got
 
@@ -94,7 +95,7 @@ def compare_figures(
             _at_path(document, figure) if figure.path else _of_stream(figure, tables, labels, names)
         )
         expected = figure.expected
-        share = figure.relative * abs(expected) if _is_number(expected) else 0.0
+        share = figure.relative * abs(expected) if is_real(expected) else 0.0
         compared.append(
             ComparedFigure(
                 name=name,
@@ -107,15 +108,9 @@ def compare_figures(
     return compared
 
 
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _exactly(value: FigureValue) -> str:
     """Return a value in words that no other has: a number in all its digits, a text in quotes."""
-    return (
-        str(value) if _is_number(value) else repr(value) if isinstance(value, str) else shown(value)
-    )
+    return str(value) if is_real(value) else repr(value) if isinstance(value, str) else shown(value)
 
 
 def _at_path(document: Mapping[str, Any], figure: BaselineFigure) -> tuple[FigureValue, str]:

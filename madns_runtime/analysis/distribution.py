@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.analysis.quantiles import quantile_of
 from madns_runtime.analysis.values import Floats
 
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "p01": 0.01, "p001": 0.001}
@@ -90,7 +91,11 @@ class Distribution:
         with np.errstate(over="ignore", invalid="ignore"):  # what diverged has no mean
             mean = float((values * self._counts).sum() / count)
             variance = float((self._counts * (values - mean) ** 2).sum() / count)
-        quantiles = {name: self._quantile(q) * scale for name, q in QUANTILES.items()}
+        cumulated = np.cumsum(self._counts)
+        quantiles = {
+            name: quantile_of(self._values, cumulated, share) * scale
+            for name, share in QUANTILES.items()
+        }
         return Summary(
             count=count,
             mean=mean,
@@ -99,18 +104,6 @@ class Distribution:
             max=float(values[-1]),
             **quantiles,
         )
-
-    def _quantile(self, quantile: float) -> float:
-        """Return a quantile as numpy's default does: linear between the two nearest samples."""
-        cumulated = np.cumsum(self._counts)
-        position = quantile * (int(cumulated[-1]) - 1)
-        low = math.floor(position)
-        lower, upper = np.searchsorted(cumulated, (low, math.ceil(position)), "right")
-        below, above = float(self._values[lower]), float(self._values[upper])
-        share = position - low
-        if math.isinf(above - below):  # they are farther apart than a float can tell
-            return below * (1.0 - share) + above * share
-        return below + share * (above - below)
 
 
 def summarise(samples: NDArray[Any]) -> Summary | None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from madns_runtime.config import RunConfig
 from madns_runtime.faults.intended_losses import IntendedLosses
-from madns_runtime.plain_values import from_mapping
+from madns_runtime.plain_values import first_few, from_mapping
 from madns_runtime.protocol.messages import ActionOrder
 from madns_runtime.timeline.action import (
     ActionHandler,
@@ -120,7 +120,9 @@ class AgentOrders:
         # Each agent is sent to, whatever became of the one before.
         absent = [agent for agent in action.agents if not self._post(agent, order)]
         if len(absent) == len(action.agents):
-            raise ActionRefused(f"not there at present: {_told(action.agents)}")
+            raise ActionRefused(
+                f"not there at present: {first_few(action.agents, AGENTS_TOLD_MAX) or 'no agent'}"
+            )
         return absent
 
 
@@ -273,9 +275,3 @@ def timeline_runner(  # noqa: PLR0913 - the collaborators of a seam, most keywor
         duration_s=config.time.duration_s,
     )
     return runner, {word: kind for word, kind in kinds.items() if word in handlers}
-
-
-def _told(agents: Sequence[str]) -> str:
-    shown = ", ".join(agents[:AGENTS_TOLD_MAX]) or "no agent"
-    more = len(agents) - AGENTS_TOLD_MAX
-    return f"{shown} and {more} more" if more > 0 else shown

@@ -55,7 +55,7 @@ def holds(bounds: ValueBounds, values: NDArray[Any]) -> Flags:
     if bounds.text is not None:
         found: Flags = _are(values, bounds.text) != bounds.is_negated
         return found
-    numbers = _numbers(values)
+    numbers = as_numbers(values)
     within = np.ones(len(numbers), bool)
     if bounds.low is not None:
         within &= numbers >= bounds.low if bounds.is_closed else numbers > bounds.low
@@ -65,7 +65,7 @@ def holds(bounds: ValueBounds, values: NDArray[Any]) -> Flags:
     return held
 
 
-def _numbers(values: NDArray[Any]) -> Floats:
+def as_numbers(values: NDArray[Any]) -> Floats:
     """Return values as numbers: NaN where one is none, such as a text in a field whose kind nobody declared."""
     if values.dtype != object:
         return values.astype(np.float64)

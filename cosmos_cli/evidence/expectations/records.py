@@ -10,7 +10,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from cosmos_cli.evidence.expectations.accumulators import Floats, Places
+from cosmos_cli.evidence.expectations.accumulators import Floats, Places, as_numbers
 from cosmos_cli.evidence.streams import NUMBER_KINDS
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST, TIME
@@ -180,7 +180,7 @@ def _times(
     if time is None:
         return np.zeros(len(next(iter(columns.values())))), None
     values = columns[time]
-    numbers = values.astype(np.float64) if values.dtype != object else _floats(values)
+    numbers = as_numbers(values)
     known = np.flatnonzero(~np.isnan(numbers))
     if len(known) < len(numbers):
         begins = 0 if last_s is not None else int(known[0]) if len(known) else len(numbers)
@@ -190,10 +190,6 @@ def _times(
         numbers[:begins] = 0.0
     newest_s = float(numbers[known[-1]]) if len(known) else last_s
     return np.maximum(numbers, 0.0), newest_s
-
-
-def _floats(values: NDArray[Any]) -> Floats:
-    return np.array([float(v) if isinstance(v, int | float) else np.nan for v in values.tolist()])
 
 
 def _with_details(

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.plain_values import first_few
 from madns_runtime.plugin.api import PlannedAction
 from madns_runtime.simulations.constellation.actions import (
     DARKEN_STATION,
@@ -81,7 +82,7 @@ class _Fleet:
 
     def without(self, agents: Sequence[str], has: Callable[[Vehicle], bool]) -> str:
         """Return the names of those agents that have not what is asked for, as a message shows them."""
-        return _named([agent for agent in agents if not has(self.vehicle(agent))])
+        return first_few([agent for agent in agents if not has(self.vehicle(agent))], NAMED_MAX)
 
     def station_fault(self, name: str) -> str | None:
         """Return what is wrong with a station's name."""
@@ -106,7 +107,7 @@ def _telecommand_faults(fleet: _Fleet, action: PlannedAction) -> Found:
     if deaf:
         yield (
             "agents",
-            f"{_named(deaf)}: no flight software that could hear it; parameters.flight gives it some",
+            f"{first_few(deaf, NAMED_MAX)}: no flight software that could hear it; parameters.flight gives it some",
         )
 
 
@@ -195,13 +196,6 @@ _RULES: Final[Mapping[str, Callable[[_Fleet, PlannedAction], Found]]] = {
     STICK_THRUSTER_OPEN.word: _stuck_faults,
     FAIL_WHEELS.word: _wheel_faults,
 }
-
-
-def _named(agents: Sequence[str]) -> str:
-    """Return the first of some agents' names, and how many more there are."""
-    more = len(agents) - NAMED_MAX
-    named = ", ".join(agents[:NAMED_MAX])
-    return f"{named} and {more} more" if more > 0 else named
 
 
 def _meant(name: str, known: Sequence[str]) -> str:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.analysis.quantiles import quantile_of
+
 COUNTED_US = 65_536
 """Round trips below this, us, have a place of their own in an array: 4 bytes each."""
 LONG_VALUES_MAX = 4096
@@ -54,9 +56,9 @@ class RoundTrips:
             "min": low,
             "max": high,
             "range": high - low,
-            "p50": _quantile(values, reached, 0.5),
-            "p99": _quantile(values, reached, 0.99),
-            "p999": _quantile(values, reached, 0.999),
+            "p50": quantile_of(values, reached, 0.5),
+            "p99": quantile_of(values, reached, 0.99),
+            "p999": quantile_of(values, reached, 0.999),
         }
         return {name: round(value, 3) for name, value in figures.items()}
 
@@ -81,12 +83,3 @@ class RoundTrips:
             [self._long[value] for value in above],
         ]
         return values, np.concatenate(counts).astype(np.int64)
-
-
-def _quantile(values: NDArray[np.float64], reached: NDArray[np.int64], share: float) -> float:
-    """Return a quantile as numpy's default does: linear between the two nearest samples."""
-    position = share * (int(reached[-1]) - 1)
-    first = math.floor(position)
-    lower, upper = np.searchsorted(reached, (first, math.ceil(position)), "right")
-    below, above = float(values[lower]), float(values[upper])
-    return below + (position - first) * (above - below)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.plain_values import first_few
 from madns_runtime.simulations.constellation.orbit.constants import (
     EARTH_POLAR_RADIUS_M,
     GravityModel,
@@ -307,14 +308,12 @@ def _check_finite(
     sound = np.asarray(np.isfinite(states).all(axis=2))
     vehicles = np.flatnonzero(~sound.all(axis=1))
     faults = []
-    for vehicle in vehicles[:FAULTS_MAX].tolist():
+    for vehicle in vehicles.tolist():
         knot = int(np.argmin(sound[vehicle]))
         what = f"expected a finite state, got {states[vehicle, knot].tolist()}"
         faults.append(f"{parameters.name_of(vehicle)}: {what}, at {times_s[knot]:g} s")
-    if len(vehicles) > FAULTS_MAX:
-        faults.append(f"and {len(vehicles) - FAULTS_MAX} more")
     if faults:  # else their sum alone is too large
-        raise ConfigurationError("\n".join(faults))
+        raise ConfigurationError(first_few(faults, FAULTS_MAX, "\n"))
 
 
 Part = tuple[StretchRequest, PropagationParameters]

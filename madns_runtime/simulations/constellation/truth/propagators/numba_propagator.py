@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError
+from madns_runtime.plain_values import first_few
 from madns_runtime.simulations.constellation.orbit import atmosphere
 from madns_runtime.simulations.constellation.orbit.constants import (
     EARTH_FLATTENING,
@@ -144,8 +145,6 @@ def _raise_failures(
         return
     faults = [
         f"{parameters.name_of(vehicle)}: numba DOP853 from {t0_s:g} s: {WHY[int(outcomes[vehicle])]}"
-        for vehicle in failed[:FAULTS_MAX].tolist()
+        for vehicle in failed.tolist()
     ]
-    if len(failed) > FAULTS_MAX:
-        faults.append(f"and {len(failed) - FAULTS_MAX} more")
-    raise ConfigurationError("\n".join(faults))
+    raise ConfigurationError(first_few(faults, FAULTS_MAX, "\n"))
