@@ -28,6 +28,7 @@ from cosmos_cli.ui.console import (
     open_standard_streams,
     print_error,
     print_json,
+    print_json_line,
     tell_lost_output,
 )
 from cosmos_cli.ui.out_of_memory import is_out_of_memory, memory_text
@@ -38,6 +39,8 @@ EXIT_CODE_UNREAD = 128 + signal.SIGPIPE
 """As a shell tells of a program that wrote to a reader which has gone: no failure, and nothing that is whole."""
 QUICK = ("ping", "exec", "up")
 """Commands whose every millisecond is told, and which leave nothing to be done here."""
+OF_LINES = ("logs",)
+"""Commands whose --json is one object per line, an error's as well."""
 CLICK_ERROR: Any = USAGE_ERROR.__mro__[1]
 """Base of all errors of usage."""
 
@@ -145,6 +148,14 @@ def _wants_json(arguments: Sequence[str]) -> bool:
     return "--json" in arguments[:end]
 
 
+def _print_description(description: dict[str, Any]) -> None:
+    """Print an error as JSON, unless the command's one document is printed already: whoever reads it takes no second."""
+    if invocation.current().verb in OF_LINES:
+        print_json_line(description)
+    elif not invocation.has_result():
+        print_json(description)
+
+
 def _plain(kind: str, message: str, exit_code: int) -> dict[str, Any]:
     return {"error": {"kind": kind, "message": message}, "exit_code": exit_code}
 
@@ -153,7 +164,7 @@ def _report(description: dict[str, Any], text: str, wants_json: bool, *, bare: b
     """Print an error; *bare* without the word: where file:line:col starts the line, and where nothing is wrong."""
     try:
         if wants_json:
-            print_json(description)
+            _print_description(description)
         print_error(text, bare=bare)
     except OSError:  # nobody is there to read it; the exit code still tells
         _leave_quietly()

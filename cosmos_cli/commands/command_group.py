@@ -109,7 +109,13 @@ class StrictCommand(typer.core.TyperCommand):
     """A command that refuses an option given twice where one value counts: the first would be dropped in silence."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the command's words."""
+        """Read the command's words, which are remembered first: how an error in them is told depends on them."""
+        invocation.record(
+            str(self.name),
+            args,
+            frozenset(name for p in self.params if _takes_value(p) for name in p.opts),
+            has_tail=not ctx.allow_interspersed_args,
+        )
         seen: set[str] = set()
         for parameter in self.make_parser(ctx).parse_args(args=list(args))[2]:
             name = str(parameter.name)
@@ -118,12 +124,6 @@ class StrictCommand(typer.core.TyperCommand):
                 hint = f"; join the patterns: {words} 'A,B'" if name == "limit" else ""
                 raise USAGE_ERROR(f"{words} is given twice, and only one could count{hint}", ctx)
             seen.add(name)
-        invocation.record(
-            str(self.name),
-            args,
-            frozenset(name for p in self.params if _takes_value(p) for name in p.opts),
-            has_tail=not ctx.allow_interspersed_args,
-        )
         return super().parse_args(ctx, args)
 
 

@@ -23,13 +23,12 @@ from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
-from cosmos_cli.system.named_file import named_file
+from cosmos_cli.system.named_file import check_writable, named_file
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
 from cosmos_cli.ui.progress import told_progress
 from cosmos_cli.view.factory import make_view
-from madns_runtime.partial_file import check_replaceable
 
 RUNS_MAX = 16
 """Runs of one comparison."""
@@ -85,7 +84,7 @@ def diff(
     code = ExitCode.OK
     names = [a, *others]
     if html is not None:
-        _check_replaceable(html)
+        check_writable(html)
     if len(names) > RUNS_MAX:
         raise InputError(f"expected at most {RUNS_MAX} runs, got {len(names)}")
     if run_first:
@@ -118,18 +117,6 @@ def _tell(console: Console, comparisons: Sequence[Comparison], html: Path | None
         console.say(f"comparison written to {html}")
     elif figures := sum(map(count_figures, comparisons)):
         console.say(f"{counted(figures, 'figure')} more with --html FILE")
-
-
-def _check_replaceable(path: Path) -> None:
-    """
-    Refuse a file that could not be written, before anything is run or read for it.
-
-    Raises:
-        InputError: It could not.
-    """
-    with named_file(path):
-        check_replaceable(path)
-        path.parent.stat()
 
 
 def _overrides(set_: list[str] | None, duration_s: float | None) -> list[str]:

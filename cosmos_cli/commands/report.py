@@ -20,9 +20,8 @@ from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.report.build import build_sections, with_simulation
 from cosmos_cli.report.html import write_report
 from cosmos_cli.report.terminal import print_report
-from cosmos_cli.system.named_file import named_file
+from cosmos_cli.system.named_file import check_writable, named_file
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
-from madns_runtime.partial_file import check_replaceable
 
 
 def report(
@@ -37,6 +36,8 @@ def report(
 ) -> None:
     """Show what a run recorded: verdict, checks, tables; figures are in report.html of the run."""
     console = Console(json=as_json, quiet=quiet)
+    if html is not None:
+        check_writable(html)
     found = find_run(runs_root(folder), run)
     document = collected_document(found, run)
     refuse_foreign_tables(found)
@@ -51,7 +52,6 @@ def report(
         console.print_json(with_simulation(found, document, console.warn))
     if html is not None:
         with named_file(html):
-            check_replaceable(html)
             console.say(f"report written to {write_report(found, document, html)}")
     elif not as_json:
         print_report(console, document, build_sections(found, document))

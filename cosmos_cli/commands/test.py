@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.commands.run_arguments import RunsOption
-from cosmos_cli.errors import InputError
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import runs_root, utc_now
 from cosmos_cli.testing.case import CaseSettings, SuiteCase
 from cosmos_cli.testing.discovery import ChosenCases, FoundScenarios, choose_cases, find_scenarios
@@ -136,13 +136,17 @@ def test(
     result = _run(console, chosen.cases, options)
     seconds = time.monotonic() - started_s
     remember_failed(result.outcomes)
+    code = result.exit_code
     try:
         if junit is not None:
             cases = list(junit_cases(result.outcomes, chosen.cases))
             write_junit(junit, cases, seconds=seconds, started_utc=started_utc)
+    except InputError as error:
+        code = error.exit_code
+        raise
     finally:  # a disk that is full by now takes no file, and what failed is told all the same
-        _tell(console, result, chosen, seconds)
-    return int(result.exit_code)
+        _tell(console, result, chosen, seconds, code=code)
+    return int(code)
 
 
 def _instead(junit: Path | None) -> str:
@@ -151,8 +155,10 @@ def _instead(junit: Path | None) -> str:
     )
 
 
-def _tell(console: Console, result: SuiteResult, chosen: ChosenCases, seconds: float) -> None:
-    """Print failures and the last line, or all of it as JSON."""
+def _tell(
+    console: Console, result: SuiteResult, chosen: ChosenCases, seconds: float, *, code: ExitCode
+) -> None:
+    """Print failures and the last line, or all of it as JSON; *code* is the command's."""
     ordered = in_order(result.outcomes, chosen.cases)
     for line in failure_lines(ordered):
         console.data(line)
@@ -168,7 +174,7 @@ def _tell(console: Console, result: SuiteResult, chosen: ChosenCases, seconds: f
             "not_run": result.not_run,
             "deselected": chosen.deselected,
             "seconds": round(seconds, 3),
-            "exit_code": int(result.exit_code),
+            "exit_code": int(code),
         }
     )
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from cosmos_cli.errors import InputError
+from madns_runtime.partial_file import check_replaceable
 
 
 @contextlib.contextmanager
@@ -21,3 +22,15 @@ def named_file(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def check_writable(path: Path) -> None:
+    """
+    Refuse a file that could not be written, before anything is run, read or told for it.
+
+    Raises:
+        InputError: It could not.
+    """
+    with named_file(path):
+        check_replaceable(path)
+        path.parent.stat()

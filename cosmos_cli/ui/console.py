@@ -25,6 +25,7 @@ import typer
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.system.import_turn import IMPORT_TURN
+from cosmos_cli.ui import invocation
 from cosmos_cli.ui.foreign_text import clean_line, clean_text
 
 JsonOption = Annotated[
@@ -99,7 +100,7 @@ class Console:
     def print_json_line(self, value: Any) -> None:
         """Print *value* as one line of JSON on stdout if --json was asked for: of many values, each as it comes."""
         if self.json:
-            _write(sys.stdout, json.dumps(value, allow_nan=False))
+            print_json_line(value)
 
     def table(self, columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
         """Print a table on stdout: framed on a terminal that is wide enough, aligned plain lines elsewhere."""
@@ -136,8 +137,14 @@ def _print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> No
 
 
 def print_json(value: Any) -> None:
-    """Print *value* as JSON on stdout."""
+    """Print *value* as JSON on stdout: the one document of the command."""
+    invocation.note_result()
     _write(sys.stdout, json.dumps(value, indent=2, allow_nan=False))
+
+
+def print_json_line(value: Any) -> None:
+    """Print *value* as one line of JSON on stdout."""
+    _write(sys.stdout, json.dumps(value, allow_nan=False))
 
 
 def print_error(text: str, *, bare: bool = False) -> None:

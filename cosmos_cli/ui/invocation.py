@@ -68,12 +68,13 @@ class Invocation:
 
 NOTHING = Invocation(verb="")
 _current = NOTHING
+_has_result = False
 
 
 def forget() -> None:
     """Begin another command line, of which nothing is read yet."""
-    global _current  # noqa: PLW0603 - a process carries out one command line
-    _current = NOTHING
+    global _current, _has_result  # noqa: PLW0603 - a process carries out one command line
+    _current, _has_result = NOTHING, False
 
 
 def record(verb: str, words: Sequence[str], valued: frozenset[str], *, has_tail: bool) -> None:
@@ -85,3 +86,14 @@ def record(verb: str, words: Sequence[str], valued: frozenset[str], *, has_tail:
 def current() -> Invocation:
     """Return the command line that is being carried out; NOTHING before its words are understood."""
     return _current
+
+
+def note_result() -> None:
+    """Remember that the one document that --json promises is printed."""
+    global _has_result  # noqa: PLW0603 - a process carries out one command line
+    _has_result = True
+
+
+def has_result() -> bool:
+    """Tell whether it is printed: whoever reads it takes no second one."""
+    return _has_result

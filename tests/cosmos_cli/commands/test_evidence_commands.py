@@ -156,6 +156,15 @@ def test_report_to_an_impossible_path_is_bad_input(made, tmp_path, capsys):
     assert "no/such/here.html: cannot be written" in capsys.readouterr().err
 
 
+def test_report_as_json_to_an_impossible_path_is_one_document(made, tmp_path, capsys):
+    finish(made)
+
+    assert app.run(["report", "1", "--json", "--html", str(tmp_path / "no/such/here.html")]) == 2
+
+    document = json.loads(capsys.readouterr().out)
+    assert "no/such/here.html: cannot be written" in document["error"]["message"]
+
+
 def test_report_takes_no_devices_place(made, tmp_path, capsys):
     finish(made)
     pipe = tmp_path / "pipe"

@@ -524,3 +524,13 @@ def test_answers_of_a_machine_are_taken_in_their_order_whenever_they_come(made, 
 
     assert told == ["a2 7", "a2 8"]
     assert next(portions, None) is None  # nobody is waited for any more
+
+
+@pytest.mark.parametrize(
+    ("words", "kind"), [(["99"], "input"), (["--nope"], "usage"), (["--lines", "x"], "usage")]
+)
+def test_error_as_json_is_one_line_as_all_of_its_lines_are(tmp_path, capsys, words, kind):
+    assert cosmos(["logs", "--runs", str(tmp_path), "--json", *words]) == 2
+
+    (line,) = capsys.readouterr().out.splitlines()
+    assert json.loads(line)["error"]["kind"] == kind

@@ -285,6 +285,29 @@ def test_the_verdict_of_a_run_is_told_though_junit_xml_cannot_be_written_at_the_
     assert capsys.readouterr().out == "CHECK BROKEN: x\n"
 
 
+def test_json_stays_one_document_though_junit_xml_cannot_be_written_at_the_end(
+    cosmos, monkeypatch, capsys
+):
+    path = scenario(cosmos, "s")
+
+    def fail_all(cases, options, tell):
+        """Let every test fail, and the folder of the results go."""
+        (cosmos.folder / "out").rmdir()
+        (cosmos.folder / "out").touch()
+        failed = [judge_case(case, make_result(4), is_interrupted=False) for case in cases]
+        return SuiteResult(outcomes=failed)
+
+    monkeypatch.setattr("cosmos_cli.commands.test.run_cases", fail_all)
+    monkeypatch.setattr("cosmos_cli.commands.test.remember_failed", list)
+    monkeypatch.setenv("COSMOS_RUNS", str(cosmos.runs))
+    code = run_here(["test", str(path), "--json", "--junit", str(cosmos.folder / "out/j.xml")])
+
+    said = capsys.readouterr()
+    document = json.loads(said.out)
+    assert (code, document["failed"], document["exit_code"]) == (2, 1, 2)
+    assert "out/j.xml: cannot be written: " in said.err
+
+
 def test_a_run_by_itself_writes_junit_xml_too(cosmos):
     path = scenario(cosmos, "s")
     done = cosmos("run", path, "--no-report", "--duration", "1", "--junit", "j.xml")
