@@ -96,7 +96,7 @@ def judge_expectations(
         tables: The run's.
         agents: Names of its agents.
         is_lockstep: Its time mode.
-        duration_s: Its simulated time, s.
+        duration_s: Simulated time that it had, s.
     """
     source = RecordSource(tables)
     not_judged = _not_judged(expectations, is_lockstep=is_lockstep)
