@@ -260,9 +260,7 @@ def _evidence(
         round_trip_ms=round_trip_statistics(tables),
         clock=clock_statistics(tables.get("clock")),
         missing=(*missing, *gathered.faults),
-        expectations=judge_run(
-            run, tables, planned_expectations(plan), (end.result or {}).get("duration_s")
-        ),
+        expectations=judge_run(run, tables, planned_expectations(plan), end.result or {}),
         timeline_remarks=timeline_remarks(config, tables),
         declared=declared_streams(plan),
     )

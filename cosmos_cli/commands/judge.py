@@ -77,7 +77,7 @@ def judge(
     else:
         file = load_scenario(scenario, warn=console.warn)
         expectations = expectations_for(found, file, tables)
-    judged = judge_run(found, tables, expectations, document.get("duration_s"))
+    judged = judge_run(found, tables, expectations, document)
     missing = (*_missing(document), *judged.gaps())
     code, text = conclusion_of_expectations(judged.results, missing)
     nulls = _not_finite(document)

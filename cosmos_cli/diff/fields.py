@@ -88,9 +88,13 @@ class FieldDifference:
         self._squares += other._squares
         if other.first is not None and (self.first is None or other.first.key < self.first.key):
             self.first = other.first.within(who)
-        if other.at is not None and (self.at is None or other.max > self.max):
+        if other.at is not None and (self.at is None or self._is_before(other, self.at, other.at)):
             self.max, self.values = other.max, other.values
             self.at = other.at.within(who)
+
+    def _is_before(self, other: FieldDifference, at: RecordPlace, at_other: RecordPlace) -> bool:
+        """Tell whether what another found is told in the place of what this did: it is larger; of texts, it comes first."""
+        return other.max > self.max if self.is_number else at_other.key < at.key
 
     def _add_numbers(self, a: Rows, given: NDArray[Any], other: NDArray[Any]) -> None:
         left, right = as_array(given), as_array(other)

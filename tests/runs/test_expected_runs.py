@@ -112,6 +112,19 @@ def test_a_rate_is_of_the_time_that_a_run_which_was_stopped_had(run):
     assert of_name(json.loads(again.stdout), "rate") == check
 
 
+def test_a_rate_is_of_the_time_that_a_run_which_a_check_ended_had(run):
+    few = "{name: few, stream: round_trips, statistic: count, below: 40, stop_when_broken: true}"
+    rate = "{name: rate, stream: round_trips, statistic: rate, within: [19, 21]}"
+
+    code, document = run("lockstep", few, rate, settings=("time.duration_s=10",))
+    again = run.cosmos("judge", document["run"], "--json")
+
+    assert (code, document["status"]) == (4, "broken")
+    check = of_name(document, "rate")
+    assert check["got"] == pytest.approx(40 / 2.05), "41 ticks at 20 Hz had begun"
+    assert of_name(json.loads(again.stdout), "rate") == check
+
+
 def test_a_finished_run_is_judged_by_expectations_it_did_not_have_and_again_after_collect(run):
     code, document = run("realtime", OF_TICKS, OF_HEALTH, OF_LOG, options=())
     cosmos, name = run.cosmos, document["run"]

@@ -96,7 +96,7 @@ def judge_expectations(
         tables: The run's.
         agents: Names of its agents.
         is_lockstep: Its time mode.
-        duration_s: Its simulated time, s.
+        duration_s: Simulated time that it had, s.
     """
     source = RecordSource(tables)
     not_judged = _not_judged(expectations, is_lockstep=is_lockstep)
@@ -170,11 +170,8 @@ class _Followed:
         self._names = expectation.agents or source.sources_apart(expectation.stream)
         self._agents = frozenset(self._names)
         self._records = source.records_of(expectation.stream)
-        self._window_s = max(
-            0.0,
-            min(duration_s, duration_s if expectation.to_s is None else expectation.to_s)
-            - (expectation.from_s or 0.0),
-        )
+        self._end_s = min(duration_s, duration_s if expectation.to_s is None else expectation.to_s)
+        """Of the stretch of time that a rate is of, s."""
         self._has_stream = bool(source.tables_of(expectation.stream))
         recorded = source.unit_of(expectation.stream, expectation.field)
         factor = conversion(expectation.unit, recorded) if expectation.unit else 1.0
@@ -212,8 +209,9 @@ class _Followed:
         wanted = np.ones(len(batch.t_s), bool)
         if expectation.from_s is not None:
             wanted &= batch.t_s >= expectation.from_s
-        if expectation.to_s is not None and expectation.statistic == "rate":
-            wanted &= batch.t_s < expectation.to_s  # from 2 s to 5 s are 30 ticks at 10 Hz, not 31
+        if expectation.statistic == "rate":
+            # From 2 s to 5 s are 30 ticks at 10 Hz, not 31; a device goes on before and after.
+            wanted &= batch.has_begun & (batch.t_s < self._end_s)
         elif expectation.to_s is not None and not expectation.event:
             wanted &= batch.t_s <= expectation.to_s
         if self._held is not None:
@@ -246,7 +244,8 @@ class _Followed:
             case "p99":
                 return Percentile99(self._records)
             case "count" | "rate":
-                per_s = self._window_s if expectation.statistic == "rate" else 1.0
+                window_s = max(0.0, self._end_s - (expectation.from_s or 0.0))
+                per_s = window_s if expectation.statistic == "rate" else 1.0
                 return Counted(when, per_s)
             case "first_time":
                 return FirstTime(when or bounds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -11,12 +12,11 @@ from cosmos_cli.evidence.remarks import declared_streams
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import EXPECTATIONS
 from cosmos_cli.evidence.table_labels import run_labels
-from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.models.checks import Surroundings, resolve_checks
 from cosmos_cli.models.expectation import Expectation
 from cosmos_cli.models.known_streams import KnownDevice, KnownStreams
 from cosmos_cli.models.loading import ScenarioFile
-from madns_runtime.analysis.tables import RecordedTable, Tables
+from madns_runtime.analysis.tables import RecordedRun, RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import ConfigurationError
@@ -37,7 +37,10 @@ def planned_expectations(plan: Mapping[str, Any] | None) -> tuple[Expectation, .
 
 
 def judge_run(
-    run: RunDirectory, tables: Tables, expectations: Sequence[Expectation], ran_s: object
+    run: RunDirectory,
+    tables: Tables,
+    expectations: Sequence[Expectation],
+    told: Mapping[str, Any],
 ) -> JudgedExpectations:
     """
     Judge expectations over a gathered run's tables; none where its settings are lost.
@@ -46,19 +49,27 @@ def judge_run(
         run: The run.
         tables: Its own.
         expectations: What is judged.
-        ran_s: Simulated time that its host tells, s, which a stop shortens; anything else for what was planned.
+        told: Its `status`, and `duration_s`, which a stop shortens, as its host or run.json tells them.
     """
     config = run.read_config()
     if config is None or not expectations:
         return JudgedExpectations()
-    planned_s = config.time.duration_s
+    recorded = RecordedRun(document=told, tables=tables, config=config)
     return judge_expectations(
         expectations,
         tables,
         agents=config.agents.resolved_names(),
         is_lockstep=config.time.is_lockstep,
-        duration_s=min(float(ran_s), planned_s) if is_number(ran_s) and ran_s >= 0 else planned_s,
+        duration_s=_had_s(recorded, config.agents.tick_hz),
     )
+
+
+def _had_s(recorded: RecordedRun, tick_hz: float) -> float:
+    """Return the simulated time that a run had, s: of one that ended early each tick that was begun stands for its period."""
+    if recorded.document.get("status") == "complete":
+        return recorded.duration_s
+    begun = math.floor(max(recorded.end_s, 0.0) * tick_hz) + 1
+    return min(begun / tick_hz, recorded.duration_s)
 
 
 def recorded_devices(tables: Tables) -> tuple[KnownDevice, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from cosmos_cli.evidence.expectations.accumulators import Floats, Places, as_numbers
+from cosmos_cli.evidence.expectations.accumulators import Flags, Floats, Places, as_numbers
 from cosmos_cli.evidence.streams import NUMBER_KINDS
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST, TIME
@@ -18,6 +18,8 @@ from madns_runtime.recording.records import HEALTH, Field
 from madns_runtime.recording.stream_rules import DETAILS
 
 BATCH_RECORDS = 65_536
+BEFORE_S = -1.0
+"""Stands for a time before simulated time began, s."""
 TABLE_NAMES = (
     ("agent", ""),
     (HOST, f"{HOST}_"),
@@ -40,6 +42,8 @@ class Batch:
     """Of the field that was chosen; else empty."""
     places: Places
     """Of the records, among all of whoever recorded them."""
+    has_begun: Flags
+    """Whether simulated time ran when each was recorded; those of before count as time 0."""
 
     def has(self, field: str) -> bool:
         """Tell whether the records have a field."""
@@ -71,6 +75,7 @@ class Batch:
             columns={},
             values=values[wanted],
             places=self.places[wanted],
+            has_begun=self.has_begun[wanted],
         )
 
 
@@ -129,13 +134,15 @@ class RecordSource:
                 for columns in table.batches(source, names, BATCH_RECORDS):
                     columns = _with_details(columns, beside)
                     t_s, last_s = _times(columns, time, last_s)
+                    has_begun = t_s >= 0.0
                     whole = Batch(
                         agent=source,
                         is_of_host=table.role == HOST,
-                        t_s=t_s,
+                        t_s=np.maximum(t_s, 0.0),
                         columns=columns,
                         values=np.empty(0),
                         places=np.arange(first, first + len(t_s)),
+                        has_begun=has_begun,
                     )
                     first += len(t_s)
                     yield whole
@@ -156,6 +163,7 @@ def _split(whole: Batch) -> Iterator[Batch]:
             t_s=whole.t_s[rows],
             columns={key: values[rows] for key, values in whole.columns.items()},
             places=whole.places[rows],
+            has_begun=whole.has_begun[rows],
         )
 
 
@@ -174,8 +182,8 @@ def _times(
     """
     Return the simulated time of each record, s, and the last that is known; *last_s* is that of the batch before.
 
-    Records of whoever does not know the time yet are of time 0, and of an agent that was started anew of the first
-    time that it knows.
+    Records of whoever does not know the time yet are of before time 0, and of an agent that was started anew of the
+    first time that it knows.
     """
     if time is None:
         return np.zeros(len(next(iter(columns.values())))), None
@@ -187,9 +195,9 @@ def _times(
         behind = numbers[known[-1]] if len(known) else (last_s or 0.0)
         after = np.searchsorted(known, np.arange(len(numbers)))
         numbers = np.append(numbers[known], behind)[after]
-        numbers[:begins] = 0.0
+        numbers[:begins] = BEFORE_S
     newest_s = float(numbers[known[-1]]) if len(known) else last_s
-    return np.maximum(numbers, 0.0), newest_s
+    return numbers, newest_s
 
 
 def _with_details(

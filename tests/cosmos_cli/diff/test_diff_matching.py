@@ -290,3 +290,16 @@ def test_first_different_text_is_kept_with_its_place():
         )
 
     assert (found.different, found.values, found.at.key) == (2, ("delivered", "lost"), 1.0)
+
+
+@pytest.mark.parametrize("order", [(7, 3), (3, 7)])
+def test_first_different_text_of_several_sources_is_the_first_of_all(order):
+    total = FieldDifference(Field("outcome", "", "str"))
+
+    for key in order:
+        own = FieldDifference(Field("outcome", "", "str"))
+        own.add(rows([key], outcome=["delivered"]), rows([key], outcome=[f"lost-{key}"]))
+        total.merge(own, f"agent-{key}")
+
+    assert (total.at, total.values) == (total.first, ("delivered", "lost-3"))
+    assert (total.at.key, total.at.who) == (3.0, "agent-3")

@@ -467,6 +467,22 @@ def test_what_is_recorded_before_time_runs_counts_as_time_0():
     assert (least.got, least.t_s) == (5.0, 0.0)
 
 
+@pytest.mark.parametrize("rows", [1, 3, 65_536])
+def test_a_rate_is_of_records_while_simulated_time_runs_alone(rows, monkeypatch):
+    # As a device gives them in real time: on before the begin and beyond the end, where nothing says to_s.
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    t_s = np.append([np.nan, np.nan], np.arange(-1.0, DURATION_S + 1.0, 0.25))
+    table = FakeTable("state", STATE.fields, {"a": {"t_s": t_s, "x_m": np.ones(len(t_s))}})
+
+    found = judge(
+        expect(name="r", statistic="rate", agents=("a",), bounds=ValueBounds.equals(4.0)),
+        expect(name="c", statistic="count", agents=("a",), bounds=ValueBounds.above(0)),
+        tables={"state": table},
+    ).results
+
+    assert [(each.got, each.passed) for each in found] == [(4.0, True), (len(t_s), True)]
+
+
 @pytest.mark.parametrize("rows", [1, 2, 65_536])
 def test_an_agent_that_was_started_anew_and_does_not_know_the_time_yet_starts_when_it_does(
     rows, monkeypatch
