@@ -99,7 +99,8 @@ class RecordFiles:
         """Buffered bytes that have left the buffer, ever."""
         self._run = run
         self._source = source
-        self._life = life
+        self.life = life
+        """The number in the names of the files: that of the first stream, once it is created."""
         # New tuples at every change, so that the writer never walks one that changes.
         self._streams: tuple[StreamFile, ...] = ()
         self._texts: tuple[TextFile, ...] = ()
@@ -119,9 +120,9 @@ class RecordFiles:
             MachineError: The directory takes no new file.
         """
         check_schema(schema)
-        path, descriptor, number = create_file(self.directory, schema.name, self._life)
+        path, descriptor, number = create_file(self.directory, schema.name, self.life)
         if not self._streams:
-            self._life = number
+            self.life = number
         file = StreamFile(schema, path, descriptor)
         self._streams = (*self._streams, file)
         return file
