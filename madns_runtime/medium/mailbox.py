@@ -24,7 +24,7 @@ TIME_EPSILON_S: Final = 1e-9
 NUMBER_END: Final = 2**62
 """Numbers that senders give themselves lie below: what counts on from one fits 64 bits, as chance by number must."""
 NUMBERS_PER_LIFE: Final = 2**32
-"""Messages of an agent that is started anew are numbered from the next multiple of this."""
+"""Messages of an agent's process after it, started anew, are numbered from the next multiple of this."""
 WHAT_TO_DECLARE: Final = (
     "this simulation declares no medium for messages between agents: give its descriptor"
     ' medium=":function", a function of (host half, HostContext) that returns one, such as'
@@ -41,7 +41,7 @@ class Mailbox:
         agents: Names of all agents.
         has_medium: Whether the simulation declares one.
         post: Sends to the host.
-        life: Which start of the agent this is, from 1.
+        life: Which process of the agent this is, from 1.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Mailbox:
         self._receivers = {*agents, EVERYBODY} - {name}
         self._has_medium = has_medium
         self._post = post
-        self._number = 0
+        self._number = (life - 1) * NUMBERS_PER_LIFE
         self.tick_s = -math.inf
         """Time of the newest tick, which what is sent bears; none has begun before."""
         self._taken_s = -math.inf
@@ -64,16 +64,6 @@ class Mailbox:
         self._serial = 0
         self._held: list[tuple[float, str, float, int, Delivery]] = []
         self._received = self._late = self._refused = 0
-        self.begin_life(life)
-
-    def begin_life(self, life: int) -> None:
-        """
-        Take *life*, from 1, for the number of this start of the agent.
-
-        In real time its records tell it: of an agent that shares its process, and comes back to it by itself,
-        nobody else knows every start.
-        """
-        self._number = max(self._number, (life - 1) * NUMBERS_PER_LIFE)
 
     def send(
         self, to: Any, message: Any, service: Service = Service.RELIABLE, deadline_s: Any = None

@@ -94,13 +94,12 @@ class AgentRunner:
         )
         self.counted = self._port.conditions.counts
         self._session = self._port.session
-        folder = Path(launch.directory, "agents", name)
-        files = RecordFiles(folder, run=config.run, source=name, life=program.life)
+        directory = Path(launch.directory) / "agents" / name
+        files = RecordFiles(directory, run=config.run, source=name, life=program.life)
         self._recorder = recorder = Recorder(
             files, config.recording, process.writer.writes(files), tap=self._port.conditions
         )
         self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
-        self._port.mailbox.begin_life(files.life)
         self._records = ProcessRecords(self._journal, self._config.health.period_s)
         self._hardware = seat.hardware
         self._hardware.use_clock(self._port.local_s)
@@ -134,7 +133,8 @@ class AgentRunner:
         )
         self._usage_timer = reactor.call_at(math.inf, self._record_usage)  # at no time, as yet
         self._outcome = AgentOutcome(as_ordered=False, reason="did not end")
-        self._is_closed, self._takes_data = False, True
+        self._is_closed = False
+        self._takes_data = True
 
     def _make_ticks(self, seat: LoopSeat, recorder: Recorder) -> PacedTicks:
         calls = TickCalls(

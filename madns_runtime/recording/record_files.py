@@ -99,8 +99,7 @@ class RecordFiles:
         """Buffered bytes that have left the buffer, ever."""
         self._run = run
         self._source = source
-        self.life = life
-        """The number in the names of the files: that of the first stream, once it is created."""
+        self._life = life
         # New tuples at every change, so that the writer never walks one that changes.
         self._streams: tuple[StreamFile, ...] = ()
         self._texts: tuple[TextFile, ...] = ()
@@ -120,9 +119,9 @@ class RecordFiles:
             MachineError: The directory takes no new file.
         """
         check_schema(schema)
-        path, descriptor, number = create_file(self.directory, schema.name, self.life)
+        path, descriptor, number = create_file(self.directory, schema.name, self._life)
         if not self._streams:
-            self.life = number
+            self._life = number
         file = StreamFile(schema, path, descriptor)
         self._streams = (*self._streams, file)
         return file

@@ -1,19 +1,15 @@
 """What a process of agents keeps of one that leaves it, for its return."""
 
-import socket
 from types import SimpleNamespace
 
 import pytest
 
-from madns_runtime.config import AgentLaunch, Agents, RunConfig
-from madns_runtime.hardware.port import NO_HARDWARE
-from madns_runtime.medium.mailbox import NUMBERS_PER_LIFE
+from madns_runtime.config import Agents
 from madns_runtime.plugin.half import HalfFailed, RoleProgram
 from madns_runtime.protocol.events import ClockEstimated
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.realtime import agent_process
 from madns_runtime.realtime.agent import AgentRunner
-from madns_runtime.realtime.agent_calls import AgentCalls, LoopSeat
 from madns_runtime.realtime.agent_process import AgentProcess
 from madns_runtime.realtime.agent_report import AgentOutcome
 
@@ -161,59 +157,3 @@ def test_a_process_waits_for_nobody_who_was_to_return_to_a_run_that_is_over(monk
     assert (stops, process._process.awaited) == ([True], 0)
     process._return(SimpleNamespace(name="a"))
     assert process._runners == {}
-
-
-@pytest.fixture
-def agents_process(tmp_path):
-    """A function that makes the process of two agents anew, as a supervisor does that has seen so many of its ends."""
-    with socket.socket(type=socket.SOCK_DGRAM) as host:
-        host.bind(("127.0.0.1", 0))
-        launch = AgentLaunch(
-            config=RunConfig(
-                run="trial",
-                scenario="trial",
-                simulation="trial",
-                base_directory=str(tmp_path),
-                agents=Agents(count=2, tick_hz=10.0, per_process=2),
-            ),
-            run_key_hex="00" * 32,
-            session_hex="00" * 8,
-            directory=str(tmp_path),
-            machine="local",
-            agents=("agent-01", "agent-02"),
-            host_address="127.0.0.1",
-            host_port=host.getsockname()[1],
-        )
-        made = []
-
-        def make(life):
-            half = SimpleNamespace(receive=None, step=None, abandon=None)
-            program = RoleProgram(make=lambda: half, parameters=None, has_medium=True, life=life)
-            calls = AgentCalls()
-            seats = [
-                LoopSeat(name, number, calls, NO_HARDWARE)
-                for number, name in enumerate(launch.agents)
-            ]
-            process = AgentProcess(launch, seats, program, life_fd=-1, tell_killed=print)
-            process._make_runners()
-            made.append(process)
-            return process, seats
-
-        yield make
-        for process in made:
-            process._process.socket.close()
-            process._reactor.close()
-
-
-def test_no_start_of_an_agent_that_shares_its_process_gives_a_number_of_another(agents_process):
-    def first_number(runner):
-        runner._port.mailbox.due(0.5)
-        return runner._port.mailbox.send("agent-02", "hello")
-
-    numbers = []
-    for life in (1, 2):
-        process, seats = agents_process(life)
-        process._lives[seats[0].name] = life + 1  # once it was here, and a fault has ended it since
-        numbers.append(first_number(process._make_runner(seats[0])))
-
-    assert numbers == [NUMBERS_PER_LIFE, 3 * NUMBERS_PER_LIFE]
