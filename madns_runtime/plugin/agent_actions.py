@@ -43,6 +43,9 @@ class AgentActions:
         self._own = own
         self._begun: set[int] = set()
         """Numbers of the simulation's actions that this start of the agent has begun, and that are to end."""
+        self._taken: set[int] = set()
+        """Numbers of all whose begin came: in real time one that was ordered while this start set itself up is ordered anew
+        once it has returned, as all that is in force."""
         self._refused: set[int] = set()
         """Numbers of those that it has refused to begin: told once, their ends ask for nothing."""
 
@@ -63,7 +66,9 @@ class AgentActions:
     def _take(self, order: ActionOrder, kind: ActionKind) -> None:
         action = with_instance(self._action(order), kind)
         if not order.is_end:
-            self._begin(order, action)
+            if order.number not in self._taken:
+                self._taken.add(order.number)
+                self._begin(order, action)
             return
         if order.number in self._refused:
             self._refused.remove(order.number)

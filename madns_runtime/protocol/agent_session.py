@@ -143,6 +143,7 @@ class AgentSession:
 
     def setup_finished(self, now_s: float) -> None:
         """Take note that the agent's half is set up; the host is told once its clock is known here."""
+        self._heard_s = now_s  # while it worked, it did not listen
         if self._is_clock_known(now_s):
             self._say_ready(now_s)
             return
@@ -350,7 +351,6 @@ class AgentSession:
         self._ready_due_s = None
         self._fire(AgentEvent.SETUP_FINISHED)
         self._state_deadline_s = now_s + self._timeouts.agent_setup_s + self._timeouts.silence_s
-        self._heard_s = now_s
         self._send(messages.SimulationReady(), Service.SYNC, now_s)
         self._events.extend(self._held)
         self._held.clear()

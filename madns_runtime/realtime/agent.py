@@ -283,7 +283,7 @@ class AgentRunner:
         self._usage_timer.reschedule(self._records.usage_due_s + self._session.ping_slack_s)
 
     def _ticks_over(self) -> None:
-        self._last_answers.begin(self._port.local_s(self._ticks.duration_s))
+        self._last_answers.begin(self._port.local_s(self._ticks.over_s()))
 
     def _step_failed(self, error: BaseException) -> None:
         self._fail(self.half.failure("step", error))

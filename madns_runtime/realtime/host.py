@@ -287,10 +287,10 @@ class HostRuntime:
         now_s = monotonic()
         lead_s = self._config.timeouts.start_lead_s
         freeze_garbage()
-        self._port.t0_s = t0_s = monotonic() + lead_s
+        self._port.t0_s = monotonic() + lead_s
         self._report.t0_utc = utc_at_iso(lead_s)
         self._recorder.set_t0(self._report.t0_utc)
-        self._session.start(t0_s, self._config.time.duration_s, now_s)
+        self._port.tell_start(now_s)
         self._calls.is_counting = True
         self._call("start", -lead_s)
         self._half.begin_timer(-lead_s)

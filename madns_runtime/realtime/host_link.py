@@ -19,6 +19,7 @@ from madns_runtime.protocol.messages import Delivery, Service, TransmissionRefus
 from madns_runtime.protocol.states import HostState
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.udp import UdpSocket
+from madns_runtime.timing.rate import last_period_s
 
 BEST, SYNC = Service.BEST, Service.SYNC
 
@@ -73,8 +74,15 @@ class HostPort:
         self._kept_for: Address | None = None
         self._kept: list[bytes] = []
         self._lead_s = config.timeouts.start_lead_s
+        # Ticks are spread over their periods: the last ones may be due behind the end.
+        self._last_s = last_period_s(config.time.duration_s, config.agents.tick_hz)
         # Infinite is never: the timer is made once and moved.
         self._timer = reactor.call_at(math.inf, on_due)
+
+    def tell_start(self, now_s: float) -> None:
+        """Tell every agent when simulated time begins, once that is set."""
+        if self.t0_s is not None:
+            self.session.start(self.t0_s, self._last_s, now_s)
 
     def flush(self) -> None:
         """Send what is due, and what soon arrives of messages between agents."""

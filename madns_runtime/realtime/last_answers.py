@@ -69,7 +69,9 @@ class LastAnswers:
             return
         now_s = monotonic()
         if self._asked_s == math.inf:
-            self._asked_s = session.ping_due_s = now_s
+            self._asked_s = now_s
+            # One that was due earlier stays so: it tells that this process was held up, for which nobody is blamed.
+            session.ping_due_s = min(session.ping_due_s, now_s)
             session.handle_timer(now_s)
         until_s = self._until_s(now_s)
         if now_s >= until_s:

@@ -109,6 +109,10 @@ class PacedTicks:
             if self.pacer.is_over and self._is_running():
                 self._calls.ended()
 
+    def over_s(self) -> float:
+        """Return the simulated time at which the run is over and the last tick due, s: its phase may take that behind the end."""
+        return max(self.duration_s, self.pacer.deadline_of(self.pacer.tick_count - 1))
+
     def finish(self, now_s: float) -> None:
         """Close the account at simulated time *now_s*, s."""
         self.pacer.finish(now_s)

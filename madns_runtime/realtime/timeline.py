@@ -146,10 +146,10 @@ class HostTimeline:
     def _stop(self) -> None:
         tick_hz, now_s = self._config.agents.tick_hz, self._port.now_s()
         end_s = math.ceil((max(now_s, 0.0) + STOP_LEAD_S) * tick_hz) / tick_hz
+        self.runner.close()  # nothing more takes place, though the run's own end may be nearer
         if end_s >= self._report.duration_s:
             return
         self._report.duration_s = self._end_s = self._conditions.end_s = end_s
-        self.runner.close()
         self.faults.end_at(end_s)
         for agent in self._config.agents.resolved_names():
             self._post_stop(agent, end_s)

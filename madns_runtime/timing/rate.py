@@ -31,6 +31,16 @@ def count_ticks(duration_s: float, tick_hz: float) -> int:
     return max(int(duration_s > 0.0), nearest if is_whole else math.ceil(exact))
 
 
+def last_period_s(duration_s: float, tick_hz: float) -> float:
+    """
+    Return when the periods of all ticks of a run of *duration_s* are over, s since T0: no tick is due later, whatever its phase.
+
+    Where the duration is no whole number of periods that is behind it: at 0.25 Hz the third tick of 8.5 s is due at 8 s
+    or, with a phase, up to 12 s.
+    """
+    return max(duration_s, count_ticks(duration_s, tick_hz) / tick_hz)
+
+
 class TickTiming(NamedTuple):
     """One tick that is due now. A tuple, because one is made for every tick of every agent."""
 

@@ -80,3 +80,15 @@ def test_what_was_refused_is_told_once_and_has_no_end() -> None:
 
     assert start.called == [("begin_action", 3)]
     assert start.journal.refused == ["action_refused: no brakes"]
+
+
+def test_what_is_ordered_again_of_an_agent_that_has_returned_begins_once() -> None:
+    start, refusing = Start(), Start("no brakes")
+
+    for each in (start, refusing):
+        for is_end in (False, False, True):
+            each.take(3, is_end=is_end)
+
+    assert start.called == [("begin_action", 3), ("end_action", 3)]
+    assert refusing.called == [("begin_action", 3)]
+    assert refusing.journal.refused == ["action_refused: no brakes"]

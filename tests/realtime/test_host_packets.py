@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from madns_runtime.config import Agents, HostLaunch, Network, RunConfig, TimeSettings
 from madns_runtime.errors import PluginError
 from madns_runtime.protocol.bundle import BUNDLE, bundle_up, split
 from madns_runtime.protocol.datagram import OVERHEAD_BYTES
@@ -123,3 +124,26 @@ def test_what_cannot_be_sent_is_told_to_who_sends_it_also_where_a_fault_would_ho
     assert held == []
     port.send("agent-01", [1], Service.BEST)
     assert len(held) == 1
+
+
+def test_agents_have_time_for_the_last_tick_of_a_run_of_no_whole_periods():
+    config = RunConfig(
+        run="trial",
+        scenario="trial",
+        simulation="trial",
+        base_directory=".",
+        agents=Agents(count=2, tick_hz=0.25),
+        time=TimeSettings(duration_s=8.5),
+        network=Network(address="127.0.0.1", port=0),
+    )
+    launch = HostLaunch(config=config, run_key_hex="00" * 32, session_hex="00" * 8, directory=".")
+    loop = SimpleNamespace(now_s=lambda: 0.0, call_at=lambda when_s, call: None)
+    port = HostPort(launch, reactor=loop, on_due=lambda: None)
+    started = []
+    port.session = SimpleNamespace(start=lambda *given: started.append(given))
+
+    port.t0_s = 100.0
+    port.tell_start(99.5)
+    port.socket.close()
+
+    assert started == [(100.0, 12.0, 99.5)]

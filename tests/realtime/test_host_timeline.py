@@ -207,3 +207,19 @@ def test_an_order_behind_the_end_is_refused_while_agents_make_their_summaries() 
     assert timeline._order(order) == ""
 
     assert events.words == ["action_began"]
+
+
+def test_behind_a_stop_that_comes_with_the_runs_own_end_nothing_takes_place() -> None:
+    session, events = Session(), Events()
+    timeline, core = a_timeline(
+        session,
+        ScheduledEntry(action="stop", at_s=59.8),
+        ScheduledEntry(action="annotate", at_s=59.9, parameters={"text": "late"}),
+        events=events,
+    )
+
+    for now_s in (59.8, 59.95):
+        core.port.now_s = lambda now_s=now_s: now_s
+        timeline._due()
+
+    assert (events.words, core.report.duration_s) == (["action_began"], 60.0)

@@ -144,3 +144,12 @@ def test_a_run_that_ended_otherwise_is_not_finished(rig):
     rig.run_until(END_S + 100.0)
 
     assert (rig.finished_s, rig.pings) == (None, [])
+
+
+@pytest.mark.parametrize("due_s", [END_S - 4.0, END_S + 0.2])
+def test_a_ping_that_is_overdue_stays_so_and_one_to_come_is_sent_at_once(rig, due_s):
+    rig.session.ping_due_s = due_s
+
+    rig.run_until(END_S)
+
+    assert (rig.pings, rig.session.ping_due_s) == ([END_S], min(due_s, END_S))

@@ -18,6 +18,7 @@ from madns_runtime.realtime import loop_account, ticks
 from madns_runtime.realtime.loop_account import NOBODY, LoopAccount, Span
 from madns_runtime.realtime.ticks import PacedTicks, TickCalls
 from madns_runtime.timing.late_causes import CAUSES, Cause
+from madns_runtime.timing.rate import Pacer
 
 TICK_HZ, DURATION_S, LATE_S = 100.0, 3.0, 0.001
 
@@ -257,3 +258,14 @@ def test_ticks_that_a_leap_of_the_clock_has_skipped_are_its_own(monkeypatch, lea
 
     assert agent.pacer.missed == missed
     assert agent.late.counts() == ({"clock": missed} if missed else {})
+
+
+def test_the_last_tick_of_a_run_of_no_whole_periods_may_be_due_behind_its_end():
+    ticks = PacedTicks.__new__(PacedTicks)
+    ticks.duration_s = 8.5
+    over_s = []
+    for phase_s in (0.0, 2.0):
+        ticks.pacer = Pacer(tick_hz=0.25, phase_s=phase_s, duration_s=8.5, overrun_s=0.0)
+        over_s.append(ticks.over_s())
+
+    assert over_s == [8.5, 10.0]

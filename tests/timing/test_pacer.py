@@ -12,6 +12,7 @@ from madns_runtime.timing.rate import (
     RealTimeFactor,
     TickTiming,
     count_ticks,
+    last_period_s,
     stagger,
 )
 
@@ -444,3 +445,17 @@ def test_a_later_end_than_the_runs_own_changes_nothing():
     pacer.end_by(5.0)
 
     assert pacer.tick_count == 2
+
+
+@pytest.mark.parametrize("tick_hz", [0.1, 0.25, 1.0, 3.0, 7.0, 333.0])
+@pytest.mark.parametrize("duration_s", [0.7, 8.5, 10.0, 61.0])
+def test_no_tick_is_due_behind_the_last_period_whatever_its_phase(tick_hz, duration_s):
+    over_s = last_period_s(duration_s, tick_hz)
+    for number in range(5):
+        pacer = make_pacer(tick_hz, stagger(number, 5, tick_hz), duration_s)
+        assert pacer.deadline_of(pacer.tick_count - 1) < over_s
+    assert duration_s <= over_s < duration_s + 1.0 / tick_hz + 1e-9
+
+
+def test_a_run_of_whole_periods_is_over_with_the_last():
+    assert [last_period_s(duration_s, 10.0) for duration_s in (0.3, 0.7, 60.0)] == [0.3, 0.7, 60.0]
