@@ -389,7 +389,7 @@ class AgentLaunch(Launch):
     host_address: str
     host_port: int
     life: Annotated[int, Ge(1)] = 1
-    """Number of this supervisor on its machine: more than 1 when the machine was lost and has returned."""
+    """Incarnation of this supervisor on its machine: more than 1 when the machine was lost and has returned."""
     first_incarnations: Mapping[str, int] = field(default_factory=dict)
     """The number that an agent's first process here gets; 1 where none is named."""
     killed_before: Mapping[str, int] = field(default_factory=dict)

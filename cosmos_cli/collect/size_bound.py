@@ -43,8 +43,8 @@ def recordable_bytes(config: RunConfig | None, agents: int, *, is_host: bool) ->
     if config is None:
         return BASE_BYTES
     ticks = count_ticks(config.time.duration_s, config.agents.tick_hz)
-    lives = 1 + config.agents.restarts_max
-    recorders = agents * lives + (config.agents.count if is_host else 0)
+    incarnations = 1 + config.agents.restarts_max
+    recorders = agents * incarnations + (config.agents.count if is_host else 0)
     return BASE_BYTES + ticks * recorders * TICK_BYTES
 
 

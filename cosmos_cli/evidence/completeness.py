@@ -165,8 +165,8 @@ def _check_source(
     if not scans:
         found.append("no records")
         return
-    lives = {scan.file.incarnation for scan in scans} | set(ended_on_purpose(summary))
-    found.extend(f"no records of incarnation {n}" for n in range(1, max(lives)) if n not in lives)
+    known = {scan.file.incarnation for scan in scans} | set(ended_on_purpose(summary))
+    found.extend(f"no records of incarnation {n}" for n in range(1, max(known)) if n not in known)
     have = {scan.file.stream for scan in scans}
     paths = {scan.file.path.name for scan in scans}
     reported = mapping_at(summary, "records", "streams")
@@ -225,5 +225,5 @@ def _line(name: str, faults: Sequence[str], cause: str | None) -> str:
 
 
 def _told(scan: StreamScan) -> str:
-    life = f" of incarnation {scan.file.incarnation}" if scan.file.incarnation > 1 else ""
-    return f"{scan.file.stream}{life} {scan.fault}"
+    which = f" of incarnation {scan.file.incarnation}" if scan.file.incarnation > 1 else ""
+    return f"{scan.file.stream}{which} {scan.fault}"

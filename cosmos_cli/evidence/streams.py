@@ -68,8 +68,8 @@ class RecordFile:
     @property
     def label(self) -> str:
         """The stream as a person is told about it, such as agent-03/ticks."""
-        life = f" (incarnation {self.incarnation})" if self.incarnation > 1 else ""
-        return f"{self.source}/{self.stream}{life}"
+        which = f" (incarnation {self.incarnation})" if self.incarnation > 1 else ""
+        return f"{self.source}/{self.stream}{which}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,8 +158,8 @@ def is_linked(path: Path, run_path: Path) -> bool:
 def open_stream_file(path: Path, role: Role, runs: Collection[str] = ()) -> RecordFile:
     """Read a stream's name and schema line; of one that cannot be read, or is of none of *runs*, the fields are empty."""
     stem = path.name.removesuffix(SUFFIX)
-    name, dot, life = stem.rpartition(".")
-    is_later = bool(dot) and INCARNATION.fullmatch(life) is not None
+    name, dot, number = stem.rpartition(".")
+    is_later = bool(dot) and INCARNATION.fullmatch(number) is not None
     try:
         schema: Mapping[str, Any] = read_stream(path).schema
     except MachineError:
@@ -176,7 +176,7 @@ def open_stream_file(path: Path, role: Role, runs: Collection[str] = ()) -> Reco
         source=source,
         stream=stream,
         stray=stray,
-        incarnation=int(life) if is_later else 1,
+        incarnation=int(number) if is_later else 1,
         fields=() if stray else _fields(schema, own),
         is_array=schema.get("shape") == "array",
         schema=version if isinstance(version := schema.get("schema"), int) else SCHEMA_VERSION,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cosmos_cli.launch import events
-from cosmos_cli.launch.request import FIRST_LIFE, Life
+from cosmos_cli.launch.request import FIRST_START, SupervisorStart
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +26,14 @@ class StartAgents:
     machine: str
     agents: tuple[str, ...]
     listening: events.Listening
-    life: Life = FIRST_LIFE
+    start: SupervisorStart = FIRST_START
 
     @property
     def name(self) -> str:
         """The supervisor's name; of a machine that has returned, with the number of its incarnation."""
-        return f"agents@{self.machine}" + (f" ({self.life.number})" if self.life.number > 1 else "")
+        return f"agents@{self.machine}" + (
+            f" ({self.start.incarnation})" if self.start.incarnation > 1 else ""
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -273,7 +273,7 @@ class Operator:
 
     def _start_agents(self, action: actions.StartAgents) -> None:
         launch = self._request.agent_launch(
-            action.machine, action.agents, action.listening, action.life
+            action.machine, action.agents, action.listening, action.start
         )
         self._start(action.name, action.machine, launch)
 

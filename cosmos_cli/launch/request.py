@@ -30,17 +30,17 @@ def make_session() -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Life:
-    """One of a machine's supervisors: a machine that was lost may return and get another."""
+class SupervisorStart:
+    """Start of a machine's supervisor: the first, or another after the machine was lost and has returned."""
 
-    number: int = 1
-    incarnations: Mapping[str, int] = field(default_factory=dict)
-    """The number of an agent's first process of this life; 1 where none is named."""
-    killed: Mapping[str, int] = field(default_factory=dict)
-    """How many processes of an agent's earlier lives were ended on purpose; 0 where none is named."""
+    incarnation: int = 1
+    first_incarnations: Mapping[str, int] = field(default_factory=dict)
+    """The number of an agent's first process under this supervisor; 1 where none is named."""
+    killed_before: Mapping[str, int] = field(default_factory=dict)
+    """How many earlier processes of an agent were ended on purpose; 0 where none is named."""
 
 
-FIRST_LIFE = Life()
+FIRST_START = SupervisorStart()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,7 +150,7 @@ class LaunchRequest:
         machine: str,
         agents: tuple[str, ...],
         listening: Listening,
-        life: Life = FIRST_LIFE,
+        start: SupervisorStart = FIRST_START,
     ) -> dict[str, Any]:
         """
         Return the launch line of a supervisor; it holds the run key.
@@ -159,7 +159,7 @@ class LaunchRequest:
             machine: Where.
             agents: Whom it runs.
             listening: Where the host listens.
-            life: Which of that machine's supervisors it is.
+            start: Which of that machine's supervisors it is.
         """
         place = self.place_of(machine)
         launch = AgentLaunch(
@@ -173,9 +173,9 @@ class LaunchRequest:
             directory=place.directory,
             is_detached=self.is_detached,
             reattach_s=self._reattach_s(place),
-            life=life.number,
-            first_incarnations=life.incarnations,
-            killed_before=life.killed,
+            life=start.incarnation,
+            first_incarnations=start.first_incarnations,
+            killed_before=start.killed_before,
             devices=devices_at(self.devices.get(machine, ()), self.config, place),
         )
         return to_mapping(launch)

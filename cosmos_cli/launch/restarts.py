@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from cosmos_cli.launch.request import LaunchRequest, Life
+from cosmos_cli.launch.request import LaunchRequest, SupervisorStart
 
 
 class Restarts:
@@ -24,7 +24,7 @@ class Restarts:
         self._killed: dict[str, int] = {}
         """How many of them a fault has ended on purpose: no failures."""
         self._done: set[str] = set()
-        self._lives: dict[str, int] = {}
+        self._machine_incarnations: dict[str, int] = {}
         self.ended: set[str] = set()
         """Agents whose process has ended, and that were not started again."""
 
@@ -58,7 +58,7 @@ class Restarts:
 
     def restartable_on(self, machine: str) -> tuple[str, ...]:
         """Return a machine's agents that were cut off and may be started once more."""
-        if self._lives.get(machine, 1) > self._restarts_max:
+        if self._machine_incarnations.get(machine, 1) > self._restarts_max:
             return ()  # also a machine on which nothing starts any more has an end
         return tuple(
             agent
@@ -67,15 +67,15 @@ class Restarts:
             and self._count(agent) - self._killed.get(agent, 0) <= self._restarts_max
         )
 
-    def next_life_on(self, machine: str) -> Life:
+    def next_start_on(self, machine: str) -> SupervisorStart:
         """Return what a new supervisor of a machine is told of those before it."""
-        number = self._lives.get(machine, 1) + 1
-        self._lives[machine] = number
+        incarnation = self._machine_incarnations.get(machine, 1) + 1
+        self._machine_incarnations[machine] = incarnation
         agents = self.supervised_on(machine)
-        return Life(
-            number=number,
-            incarnations={agent: self._count(agent) + 1 for agent in agents},
-            killed={agent: self._killed[agent] for agent in agents if agent in self._killed},
+        return SupervisorStart(
+            incarnation=incarnation,
+            first_incarnations={agent: self._count(agent) + 1 for agent in agents},
+            killed_before={agent: self._killed[agent] for agent in agents if agent in self._killed},
         )
 
     def _count(self, agent: str) -> int:

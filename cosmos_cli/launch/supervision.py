@@ -340,9 +340,9 @@ class Supervision:
             f"{machine} has returned; its agents {', '.join(agents)} rejoin", "warning"
         )
         assert self._listening is not None
-        life = self._restarts.next_life_on(machine)
+        start = self._restarts.next_start_on(machine)
         self._restarts.handed_over(agents)
-        self._agenda.do(actions.StartAgents(machine, agents, self._listening, life))
+        self._agenda.do(actions.StartAgents(machine, agents, self._listening, start))
 
     def _is_wanted(self, machine: str) -> bool:
         """Tell whether a lost machine that returns would be given its agents again."""

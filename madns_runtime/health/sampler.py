@@ -33,7 +33,7 @@ def start_sampler(  # noqa: PLR0913 - who records, and how; all by name
     machine: str,
     settings: Health,
     recording: Recording,
-    life: int = 1,
+    incarnation: int = 1,
 ) -> ChildProcess:
     """
     Start the process that records this machine's state of health. Call it before threads are started.
@@ -46,11 +46,11 @@ def start_sampler(  # noqa: PLR0913 - who records, and how; all by name
         machine: Name of this machine.
         settings: The period.
         recording: How its records reach the disk.
-        life: Which life of the process that starts it this is; the file is numbered by it.
+        incarnation: Which incarnation of the process that starts it this is; the file is numbered by it.
     """
 
     def main(lifeline: Lifeline) -> Mapping[str, Any]:
-        files = RecordFiles(directory, run=run, source=machine, life=life)
+        files = RecordFiles(directory, run=run, source=machine, incarnation=incarnation)
         recorder = Recorder(files, recording)
         recorder.open_stream(HEALTH)
         recorder.start()

@@ -132,9 +132,11 @@ class Absences:
             assert worker is not None, "one lives"
             place = self._crew.number_of(worker)
             self._outbox.move(index, place)
-            life = account.take_back(index)  # it is there again: what is sent with its data arrives
+            incarnation = account.take_back(
+                index
+            )  # it is there again: what is sent with its data arrives
             data = pack(self._half.call("initial_data", account.names[index]))
-            orders.setdefault(place, []).append((index, life, data))
+            orders.setdefault(place, []).append((index, incarnation, data))
         self._meeting.forget_answers()
         for place in sorted(orders):
             worker = self._crew.workers[place]

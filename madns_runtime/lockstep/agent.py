@@ -58,7 +58,7 @@ class LockstepAgent:
     Args:
         index: Its number among the run's agents, from 0.
         mates: What it shares with the others of its process.
-        life: Which incarnation of the agent this is.
+        incarnation: Which incarnation of the agent this is.
         devices: Those of the incarnation before, if its worker has them.
 
     Raises:
@@ -71,7 +71,7 @@ class LockstepAgent:
         index: int,
         mates: Crewmates,
         *,
-        life: int = 1,
+        incarnation: int = 1,
         devices: AgentDevices | None = None,
     ) -> None:
         self.index = index
@@ -93,7 +93,7 @@ class LockstepAgent:
             source=self.name,
             clock=mates.clock,
             tap=self.conditions,
-            life=life,
+            incarnation=incarnation,
         )
         self.columns = NewestValues(self.journal.recorder, mates.program.columns)
         self._mates = mates
@@ -108,7 +108,7 @@ class LockstepAgent:
             mates.config.agents.resolved_names(),
             has_medium=mates.program.has_medium,
             post=self._transmit,
-            life=life,
+            incarnation=incarnation,
         )
         self.devices = devices or AgentDevices(
             [each for each in mates.devices if self.name in each.users],
@@ -127,7 +127,7 @@ class LockstepAgent:
             mailbox=self.mailbox,
             hardware=self.devices.hardware,
         )
-        if life == 1:
+        if incarnation == 1:
             self._make_half()
 
     def _make_half(self) -> None:

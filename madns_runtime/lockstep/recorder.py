@@ -58,7 +58,7 @@ def open_journal(  # noqa: PLR0913 - what a journal is of; two are optional and 
     source: str,
     clock: SimulatedClock,
     tap: StreamTap | None = None,
-    life: int = 1,
+    incarnation: int = 1,
 ) -> RunJournal:
     """
     Return the journal, with a recorder, of the host or of one agent.
@@ -72,12 +72,12 @@ def open_journal(  # noqa: PLR0913 - what a journal is of; two are optional and 
         source: host, or the agent's name.
         clock: What events and logged sentences carry the time of.
         tap: Looks at the records; None if nobody does.
-        life: Which incarnation of its source this is.
+        incarnation: Which incarnation of its source this is.
 
     Raises:
         MachineError: The directory cannot be made, or takes no new file.
     """
-    files = RecordFiles(directory, run=config.scenario, source=source, life=life)
+    files = RecordFiles(directory, run=config.scenario, source=source, incarnation=incarnation)
     recorder = Recorder(
         files, config.recording, DirectWriter(files), rows_together=ROWS_TOGETHER, tap=tap
     )

@@ -324,11 +324,11 @@ class Worker:
     def _return(self, number: int, returning: list[tuple[int, int, bytes]]) -> bytes:
         """Make lost agents anew, and set them up, before tick *number*."""
         self._clock.t_s = number / self._tick_hz
-        for index, life, packed in returning:
+        for index, incarnation, packed in returning:
             self._position[0] = index * POSITIONS + frames.LOADING
             devices = self._losses.devices_of(index)
             try:
-                agent = LockstepAgent(index, self._mates, life=life, devices=devices)
+                agent = LockstepAgent(index, self._mates, incarnation=incarnation, devices=devices)
             except MadnsError as error:
                 raise AgentFailed(index, str(error)) from error
             self._agents = sorted((*self._agents, agent), key=lambda each: each.index)

@@ -23,7 +23,7 @@ TIME_EPSILON_S: Final = 1e-9
 """Rounding of tick times: what arrives at a tick's own time is received in it."""
 NUMBER_END: Final = 2**62
 """Numbers that senders give themselves lie below: what counts on from one fits 64 bits, as chance by number must."""
-NUMBERS_PER_LIFE: Final = 2**32
+NUMBERS_PER_INCARNATION: Final = 2**32
 """Messages of an agent's process after it, started anew, are numbered from the next multiple of this."""
 WHAT_TO_DECLARE: Final = (
     "this simulation declares no medium for messages between agents: give its descriptor"
@@ -41,7 +41,7 @@ class Mailbox:
         agents: Names of all agents.
         has_medium: Whether the simulation declares one.
         post: Sends to the host.
-        life: Which process of the agent this is, from 1.
+        incarnation: Which incarnation of the agent this is, from 1.
     """
 
     def __init__(
@@ -51,12 +51,12 @@ class Mailbox:
         *,
         has_medium: bool,
         post: Callable[[Transmission], None],
-        life: int = 1,
+        incarnation: int = 1,
     ) -> None:
         self._receivers = {*agents, EVERYBODY} - {name}
         self._has_medium = has_medium
         self._post = post
-        self._number = (life - 1) * NUMBERS_PER_LIFE
+        self._number = (incarnation - 1) * NUMBERS_PER_INCARNATION
         self.tick_s = -math.inf
         """Time of the newest tick, which what is sent bears; none has begun before."""
         self._taken_s = -math.inf

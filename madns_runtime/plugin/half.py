@@ -63,7 +63,7 @@ class RoleProgram:
     """Fields whose newest values are told."""
     actions: tuple[ActionKind, ...] = ()
     """Actions that the simulation declares for timelines."""
-    life: int = 1
+    incarnation: int = 1
     """Number of this process of an agent."""
     agent_parameters: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of each agent, parsed: one object for all that share them."""

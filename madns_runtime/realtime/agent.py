@@ -95,7 +95,7 @@ class AgentRunner:
         self.counted = self._port.conditions.counts
         self._session = self._port.session
         directory = Path(launch.directory) / "agents" / name
-        files = RecordFiles(directory, run=config.run, source=name, life=program.life)
+        files = RecordFiles(directory, run=config.run, source=name, incarnation=program.incarnation)
         self._recorder = recorder = Recorder(
             files, config.recording, process.writer.writes(files), tap=self._port.conditions
         )

@@ -78,7 +78,7 @@ class AgentPort:
             config.agents.resolved_names(),
             has_medium=program.has_medium,
             post=self._transmit,
-            life=program.life,
+            incarnation=program.incarnation,
         )
         self.conditions = ConditionTap(
             name,

@@ -66,7 +66,7 @@ class AgentProcess:
         self._away: set[str] = set()
         """Those of them that have ended and will return."""
         self._packs: dict[str, Pack] = {}
-        self._lives: dict[str, int] = {}
+        self._incarnations: dict[str, int] = {}
         self._counted: dict[str, dict[int, int]] = {}
         """Counts of an agent's conditions: one that returns would read that in its records, while others wait."""
         self._is_ending = False
@@ -107,11 +107,11 @@ class AgentProcess:
         return [self._make_runner(seat) for seat in self._seats]
 
     def _make_runner(self, seat: LoopSeat) -> AgentRunner:
-        life = self._lives.setdefault(seat.name, self._program.life)
+        incarnation = self._incarnations.setdefault(seat.name, self._program.incarnation)
         runner = AgentRunner(
             seat,
             self._launch,
-            replace(self._program, life=life),
+            replace(self._program, incarnation=incarnation),
             reactor=self._reactor,
             process=self._process,
             pack=self._packs[seat.name],
@@ -146,7 +146,7 @@ class AgentProcess:
             return
         self._away.discard(seat.name)
         self._process.awaited -= 1
-        self._lives[seat.name] += 1
+        self._incarnations[seat.name] += 1
         try:
             self._runners[seat.name] = runner = self._make_runner(seat)
         except MadnsError as error:  # the others of the process go on; the host misses it

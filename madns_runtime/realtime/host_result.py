@@ -155,8 +155,8 @@ def _agent_result(
 ) -> dict[str, Any]:
     summary = dict(peer.summary)
     simulation = summary.pop("simulation", {})
-    lives = (*peer.retired_records, peer.records)
-    records = {**peer.records, **_device_losses(lives)}
+    incarnations = (*peer.retired_records, peer.records)
+    records = {**peer.records, **_device_losses(incarnations)}
     return {
         "state": peer.phase.value,
         "reason": loss_reason,
@@ -165,7 +165,7 @@ def _agent_result(
         "messages": _messages(
             peer,
             records.pop("messages", None),
-            sum(told.get("held_dropped", 0) for told in lives),
+            sum(told.get("held_dropped", 0) for told in incarnations),
             ended_on_purpose=ended_on_purpose,
         ),
         "records": records,
@@ -173,14 +173,14 @@ def _agent_result(
     }
 
 
-def _device_losses(lives: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what found no room between an agent and its devices in all its lives, by device and kind; nothing of none."""
+def _device_losses(incarnations: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what found no room between an agent and its devices, all incarnations together, by device and kind."""
     total: dict[str, dict[str, int]] = {}
-    for records in lives:
+    for records in incarnations:
         for device, counts in records.get(DEVICE_LOSSES, {}).items():
             joined = total.setdefault(device, {})
             for name, count in counts.items():
-                # A device's process counts what was missed in all lives of an agent.
+                # A device's process counts what was missed in all incarnations of an agent.
                 joined[name] = count + (0 if name == "frames_missed" else joined.get(name, 0))
     return {DEVICE_LOSSES: total} if total else {}
 
@@ -204,9 +204,9 @@ def _messages(
     earlier = zip(peer.retired_counters, peer.retired_records, strict=False)
     ends = [*((host, told.get("messages")) for host, told in earlier), (host_side, agent_side)]
     joined: dict[str, Any] = {service: _joined(service, ends) for service in SERVICES}
-    lives = (*peer.retired_counters, host_side)
-    broken = [side.get("deadlines_broken", 0) for side in lives]
-    excused = [count for life, count in enumerate(broken, start=1) if life in ended_on_purpose]
+    incarnations = (*peer.retired_counters, host_side)
+    broken = [side.get("deadlines_broken", 0) for side in incarnations]
+    excused = [count for number, count in enumerate(broken, start=1) if number in ended_on_purpose]
     own = sum(
         side.get("deadlines_broken", 0)
         for side in (*(each.get("messages", {}) for each in peer.retired_records), agent_side or {})
@@ -225,14 +225,18 @@ def _messages(
 
 
 def _joined(service: str, ends: Sequence[_Ends]) -> dict[str, int | None]:
-    """Return what became of one class of service over all lives of an agent; what is lost of a stream is the last one's."""
-    lives = [_of_life(service, host_side, agent_side) for host_side, agent_side in ends]
+    """Return the counts of one class of service, summed over incarnations; what a stream lost is the last one's."""
+    incarnations = [
+        _of_incarnation(service, host_side, agent_side) for host_side, agent_side in ends
+    ]
     names = ("sent", "received", "lost", "resent", "late")
-    joined: dict[str, int | None] = {name: sum(life[name] or 0 for life in lives) for name in names}
-    return joined if service == "best" else {**joined, "lost": lives[-1]["lost"]}
+    joined: dict[str, int | None] = {
+        name: sum(each[name] or 0 for each in incarnations) for name in names
+    }
+    return joined if service == "best" else {**joined, "lost": incarnations[-1]["lost"]}
 
 
-def _of_life(
+def _of_incarnation(
     service: str, host_side: Mapping[str, Any], agent_side: Mapping[str, Any] | None
 ) -> dict[str, int | None]:
     down: Mapping[str, Any] = host_side.get(service, {})

@@ -89,7 +89,7 @@ class Supervisor:
             machine=launch.machine,
             settings=config.health,
             recording=config.recording,
-            life=launch.life,
+            incarnation=launch.life,
         )
         self._stress = start_stress(config.health.stress_workers)
         self._devices = DeviceManager(launch, tell=partial(tell_loading, fds[1]))
@@ -169,7 +169,7 @@ class Supervisor:
                         LoopSeat(name, number, calls, self._devices.hardware_of(name))
                         for number, name in enumerate(agents)
                     ],
-                    replace(self._program, life=incarnation),
+                    replace(self._program, incarnation=incarnation),
                     life_fd=self._life_read_fd,
                     tell_killed=partial(self._write_killed, entry),
                 )
@@ -389,8 +389,10 @@ class Supervisor:
         """Leave the devices' account beside the machine's records: whoever judges the run reads it there."""
         if not devices:
             return
-        life = f".{self._launch.life}" if self._launch.life > 1 else ""
-        path = Path(self._launch.directory, "machines", self._launch.machine, f"devices{life}.json")
+        number = f".{self._launch.life}" if self._launch.life > 1 else ""
+        path = Path(
+            self._launch.directory, "machines", self._launch.machine, f"devices{number}.json"
+        )
         try:
             write_whole(path, orjson.dumps(devices, option=orjson.OPT_SERIALIZE_NUMPY))
         except OSError as error:

@@ -81,13 +81,13 @@ class RecordFiles:
         directory: Where the files go; made if it is missing.
         run: Name of the run.
         source: Who records: host, an agent's or a machine's name.
-        life: Which life of its process this is; files are numbered from it.
+        incarnation: Which incarnation of its process this is; files are numbered from it.
 
     Raises:
         MachineError: The directory cannot be made.
     """
 
-    def __init__(self, directory: Path, *, run: str, source: str, life: int = 1) -> None:
+    def __init__(self, directory: Path, *, run: str, source: str, incarnation: int = 1) -> None:
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -99,7 +99,7 @@ class RecordFiles:
         """Buffered bytes that have left the buffer, ever."""
         self._run = run
         self._source = source
-        self._life = life
+        self._incarnation = incarnation
         # New tuples at every change, so that the writer never walks one that changes.
         self._streams: tuple[StreamFile, ...] = ()
         self._texts: tuple[TextFile, ...] = ()
@@ -108,10 +108,10 @@ class RecordFiles:
 
     def create_stream(self, schema: StreamSchema) -> StreamFile:
         """
-        Create the file of a stream: <name>.jsonl, or <name>.<life>.jsonl of a later life.
+        Create the file of a stream: <name>.jsonl, or <name>.<incarnation>.jsonl of a later incarnation.
 
         An existing file is left alone: the next free of .2, .3, ... is taken. The number that the
-        first stream got is where all others begin: it tells which life of the process they are of, also
+        first stream got is where all others begin: it tells which incarnation of the process they are of, also
         when an earlier one ended before it had opened them all.
 
         Raises:
@@ -119,16 +119,16 @@ class RecordFiles:
             MachineError: The directory takes no new file.
         """
         check_schema(schema)
-        path, descriptor, number = create_file(self.directory, schema.name, self._life)
+        path, descriptor, number = create_file(self.directory, schema.name, self._incarnation)
         if not self._streams:
-            self._life = number
+            self._incarnation = number
         file = StreamFile(schema, path, descriptor)
         self._streams = (*self._streams, file)
         return file
 
     def earlier_records(self, file: StreamFile) -> Iterator[dict[str, Any]]:
-        """Give what earlier lives have recorded of a stream, by field; what cannot be read is left out."""
-        from madns_runtime.recording.reader import read_stream  # few lives are not the first
+        """Give what earlier incarnations have recorded of a stream, by field; what cannot be read is left out."""
+        from madns_runtime.recording.reader import read_stream  # few incarnations are not the first
 
         number = number_of(file.path)
         for earlier in range(1, number):

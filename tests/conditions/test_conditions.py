@@ -236,16 +236,16 @@ LOOSE = StreamSchema("loose", (Field("t_s", "s"), Field("speed_m_s", "m/s")), sh
 def test_a_number_of_records_is_counted_over_all_incarnations(tmp_path, schema):
     counted = condition(stream=schema.name, times=5, from_s=0.1)
     told = []
-    for life in (1, 2, 3):
+    for incarnation in (1, 2, 3):
         tap, told = tapped([counted])
-        files = RecordFiles(tmp_path, run="r", source="a", life=life)
+        files = RecordFiles(tmp_path, run="r", source="a", incarnation=incarnation)
         recorder = Recorder(files, Recording(), tap=tap)
         recorder.open_stream(schema)
         for number in (0, 1, 2):  # the first is too early, the last is slow
             key = number if schema is DRIVE else number / 10
             recorder.record(schema.name, (key, 5.0 if number == 2 else 11.0))
             recorder.record(schema.name, (key, 12.0))
-        assert len(told) == (life >= 2)
+        assert len(told) == (incarnation >= 2)
         files.write_waiting()
 
     # The incarnation before met it; should the host not have heard of it, the next record tells.
@@ -266,10 +266,10 @@ def test_who_returns_to_its_process_counts_on_without_reading_its_records():
     for tick in range(3):
         take((tick, 11.0))
     counted = {**tap.counts(), 1: 1}
-    for life, met in ((2, 0), (3, 1)):
+    for incarnation, met in ((2, 0), (3, 1)):
         tap, told, take = opened(counted)
-        take((10 * life, 11.0))
-        take((10 * life + 1, 5.0))
+        take((10 * incarnation, 11.0))
+        take((10 * incarnation + 1, 5.0))
         assert len(told) == met
         counted = tap.counts()
 
@@ -277,9 +277,9 @@ def test_who_returns_to_its_process_counts_on_without_reading_its_records():
 
 
 def test_a_condition_that_counts_nothing_begins_anew_with_each_incarnation(tmp_path):
-    for life in (1, 2):
+    for incarnation in (1, 2):
         tap, told = tapped([condition()])
-        files = RecordFiles(tmp_path, run="r", source="a", life=life)
+        files = RecordFiles(tmp_path, run="r", source="a", incarnation=incarnation)
         recorder = Recorder(files, Recording(), tap=tap)
         recorder.open_stream(DRIVE)
         recorder.record("drive", (1, 11.0))

@@ -45,8 +45,8 @@ def run_faults(laboratory: Laboratory, timeline, *, per_process=1, duration_s=9,
     return result, laboratory.runs / result["run"]
 
 
-def ticks(folder: Path, agent: str, life: str = "") -> list[int]:
-    stream = read_stream(folder / f"agents/{agent}/steps{life}.jsonl")
+def ticks(folder: Path, agent: str, number: str = "") -> list[int]:
+    stream = read_stream(folder / f"agents/{agent}/steps{number}.jsonl")
     return [int(row[1]) for row in stream.records()]
 
 
@@ -164,8 +164,8 @@ def test_of_a_process_that_others_share_only_the_half_is_dropped_and_it_returns_
     pids = {
         event["pid"]
         for name in ("agent-01", "agent-02")
-        for life in ("", ".2")
-        for line in (folder / f"agents/{name}/events{life}.jsonl").read_text().splitlines()
+        for number in ("", ".2")
+        for line in (folder / f"agents/{name}/events{number}.jsonl").read_text().splitlines()
         if (event := json.loads(line)).get("event") == "start"
     }
     assert len(pids) == 1

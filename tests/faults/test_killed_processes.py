@@ -119,7 +119,7 @@ def test_killed_agent_is_started_again_and_rejoins_at_the_present_time(laborator
         run.wait_until_ticking(agents / "agent-02/ticks.2.jsonl")
         run.complete()
 
-    # What the first life had begun to write is cut, and said to be; if it had not begun, 4 is right.
+    # What the first incarnation had begun to write is cut, and said to be; if it had not begun, 4 is right.
     code = 4 if start_and_kill is kill_before_hello and run.finish() == 4 else 5
     document = check_ending(run, code, "complete", "agent-02 is lost: killed by SIGKILL")
     result = run.result
@@ -128,7 +128,7 @@ def test_killed_agent_is_started_again_and_rejoins_at_the_present_time(laborator
     if not is_in_run:
         return
     assert document["agents"]["incarnations"] == {"agent-02": 2}
-    # The second life's streams are beside the first's, and begin where simulated time had come to.
+    # The second incarnation's streams are beside the first's, and begin where simulated time had come to.
     ended = last_tick(agents / "agent-02/ticks.jsonl")
     assert first_tick(agents / "agent-02/ticks.2.jsonl") > ended
     assert first_tick(agents / "agent-02/waves.2.jsonl") > ended

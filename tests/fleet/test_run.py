@@ -220,8 +220,8 @@ def test_board_that_returns_is_given_its_agents_again(tower: RunTower, fault: st
     # A board that reboots ends its agents in good order: they may have said so before it is missed itself.
     assert code == 3 or (fault == "reboot" and code == 4)
     assert set(document["agents"]["incarnations"]) == {"agent-03", "agent-04"}
-    lives = sorted(path.name for path in (tower.directory / "agents/agent-03").glob("ticks.*"))
-    assert lives[0] == "ticks.2.jsonl" or lives[0] == "ticks.3.jsonl"
+    streams = sorted(path.name for path in (tower.directory / "agents/agent-03").glob("ticks.*"))
+    assert streams[0] == "ticks.2.jsonl" or streams[0] == "ticks.3.jsonl"
 
 
 def test_lost_packets_cost_no_message_that_must_arrive(tower: RunTower) -> None:

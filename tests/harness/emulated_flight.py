@@ -91,7 +91,7 @@ def lost_and_back_s(run: Path, agent: str) -> tuple[float, float]:
 
 
 def commanded(folder: Path) -> list[Any]:
-    """Return an agent's commands, over all its lives."""
+    """Return an agent's commands, over all its incarnations."""
     return [row for path in sorted(folder.glob("commands*.jsonl")) for row in records(path)]
 
 

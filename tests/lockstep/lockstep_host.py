@@ -114,9 +114,9 @@ class HostRun:
         lines = (self.folder / path).read_text().splitlines()
         return [value for line in lines if isinstance(value := json.loads(line), list)]
 
-    def events_of(self, who: str, life: str = "") -> list[dict[str, Any]]:
-        """Return what happened to the host, or to agents/NAME, in the incarnation whose files end in *life*."""
-        lines = (self.folder / who / f"events{life}.jsonl").read_text().splitlines()
+    def events_of(self, who: str, number: str = "") -> list[dict[str, Any]]:
+        """Return what happened to the host, or to agents/NAME, in the incarnation whose files end in *number*."""
+        lines = (self.folder / who / f"events{number}.jsonl").read_text().splitlines()
         return [event for line in lines if "event" in (event := json.loads(line))]
 
     def _read(self) -> None:

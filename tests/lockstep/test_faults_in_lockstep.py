@@ -39,8 +39,8 @@ def run_faults(start_host):
     return run
 
 
-def steps(run, agent="agent-04", life=""):
-    return [row[1] for row in run.records(f"agents/{agent}/steps{life}.jsonl")]
+def steps(run, agent="agent-04", number=""):
+    return [row[1] for row in run.records(f"agents/{agent}/steps{number}.jsonl")]
 
 
 def at_host(run, who="agent-04", kind="up"):
@@ -168,7 +168,7 @@ def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_f
     result = run.result()
 
     assert steps(run) == [0, 1, 2]
-    assert steps(run, life=".2") == [6, 7, 8, 9]
+    assert steps(run, number=".2") == [6, 7, 8, 9]
     assert result["lost_on_purpose"] == ["agent-04"]
     assert result["agents"]["agent-04"]["ended_on_purpose"] == [1]
     assert at_host(run, kind="lost") == [(0.3, ["killed on purpose at t = 0.3 s for 0.3 s"])]
@@ -217,7 +217,7 @@ def test_everybody_may_be_killed_if_some_return(run_faults):
     result = run.result()
 
     assert (result["status"], result["lost_on_purpose"]) == ("complete", list(ALL))
-    assert steps(run, life=".2") == [6, 7, 8, 9]
+    assert steps(run, number=".2") == [6, 7, 8, 9]
 
 
 def test_a_hung_agent_takes_no_step_and_its_records_say_which(run_faults):
@@ -259,8 +259,8 @@ def test_the_end_of_a_hang_from_before_a_restart_leaves_the_next_one_in_force(ru
     run = run_faults(first, entry("restart", at_s=0.2), second)
     run.result()
 
-    assert steps(run, life=".2") == [4, 8, 9]
-    said = [(e["event"], round(e["t_s"], 3)) for e in run.events_of("agents/agent-04", life=".2")]
+    assert steps(run, number=".2") == [4, 8, 9]
+    said = [(e["event"], round(e["t_s"], 3)) for e in run.events_of("agents/agent-04", number=".2")]
     assert said[1:3] == [("hang_begins", 0.5), ("hang_ends", 0.8)]
 
 

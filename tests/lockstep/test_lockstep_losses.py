@@ -17,9 +17,9 @@ def heard(run, word):
     return [(t_s, what) for t_s, who, what in run.records("host/heard.jsonl") if who == word]
 
 
-def steps(run, agent, life=""):
+def steps(run, agent, number=""):
     """Return the ticks that an agent's incarnation has run."""
-    rows = run.records(f"agents/{agent}/own{life}.jsonl")
+    rows = run.records(f"agents/{agent}/own{number}.jsonl")
     return [what[0] for _, what in rows if len(what) > 3]
 
 

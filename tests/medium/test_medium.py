@@ -10,7 +10,7 @@ from madns_runtime.errors import MessageTooLarge, PluginError
 from madns_runtime.medium import carrier
 from madns_runtime.medium.carrier import LEAD_S, Carrier
 from madns_runtime.medium.links import LinkMedium
-from madns_runtime.medium.mailbox import HELD_MAX, NUMBERS_PER_LIFE, Mailbox
+from madns_runtime.medium.mailbox import HELD_MAX, NUMBERS_PER_INCARNATION, Mailbox
 from madns_runtime.medium.outcomes import (
     CHANNELS_MAX,
     EVERYBODY,
@@ -67,10 +67,10 @@ def test_messages_bear_the_time_of_the_tick_and_a_number_each():
 
 
 def test_a_process_started_anew_gives_no_number_twice():
-    box, sent = mailbox(life=2)
+    box, sent = mailbox(incarnation=2)
     box.due(0.5)
 
-    assert box.send("car-2", "a") == NUMBERS_PER_LIFE
+    assert box.send("car-2", "a") == NUMBERS_PER_INCARNATION
 
 
 @pytest.mark.parametrize("to", ["car-9", "car-1", "", 3, ["car-2"]])

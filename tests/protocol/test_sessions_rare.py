@@ -304,7 +304,7 @@ def test_orders_to_a_process_that_another_replaced_are_lost_and_their_deadlines_
     assert earlier["deadlines_broken"] == earlier["sync"]["lost"] == 1
 
 
-def test_last_word_of_an_agent_that_returns_is_kept_and_is_not_taken_for_that_of_the_next_life():
+def test_last_word_of_an_agent_that_returns_is_kept_and_is_not_taken_for_that_of_the_next_incarnation():
     w = world(count=2, policy="continue")
     w.run_for(1.5)
     w.agents["agent-1"].emergency("it raised", w.now_s)

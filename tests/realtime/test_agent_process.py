@@ -18,9 +18,9 @@ def test_an_agent_that_returns_is_given_what_its_conditions_had_counted(monkeypa
     given = []
 
     def make(seat, launch, program, **more):
-        given.append((program.life, more["counted"]))
+        given.append((program.incarnation, more["counted"]))
         return SimpleNamespace(
-            counted=lambda: {3: 10 * program.life},
+            counted=lambda: {3: 10 * program.incarnation},
             start=lambda: None,
             set_scheduling=lambda grant: None,
         )
@@ -90,7 +90,7 @@ def test_every_pack_of_a_process_is_timed_anew_with_the_clock_that_they_share(mo
     process._launch = SimpleNamespace(config=config)
     process._seats = [SimpleNamespace(name=name) for name in config.agents.resolved_names()]
     process._program = RoleProgram(make=object, parameters=None)
-    process._packs, process._lives, process._counted = {}, {}, {}
+    process._packs, process._incarnations, process._counted = {}, {}, {}
 
     packs = process._make_runners()
 

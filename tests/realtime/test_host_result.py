@@ -113,8 +113,8 @@ def test_best_messages_that_never_came_are_lost_also_where_none_came_behind_them
     assert (best["sent"], best["received"], best["lost"]) == (10, 10 - len(lost), len(lost))
 
 
-def messages_of_two_lives(host, told, later_host, later_agent):
-    """Return the account of messages of an agent that told so much in its first life, and all in its second."""
+def messages_of_two_incarnations(host, told, later_host, later_agent):
+    """Return the account of messages of an agent that told so much in its first incarnation, and all in its second."""
     peer = Peer(
         name="agent-01",
         index=1,
@@ -135,7 +135,7 @@ def test_messages_of_earlier_incarnations_stay_counted():
     send_best(later_agent, later_host, sent=3, lost={1})
     earlier = {"messages": agent.counters.to_mapping()}
 
-    messages = messages_of_two_lives(host, earlier, later_host, later_agent)
+    messages = messages_of_two_incarnations(host, earlier, later_host, later_agent)
 
     best = messages["best"]
     assert (best["sent"], best["received"], best["lost"]) == (18, 14, 4)
@@ -154,7 +154,7 @@ def test_of_a_killed_incarnation_counts_what_came_of_it_and_what_it_acknowledged
     later_agent, later_host = ends()
     host.abandon()
 
-    messages = messages_of_two_lives(host, {}, later_host, later_agent)
+    messages = messages_of_two_incarnations(host, {}, later_host, later_agent)
 
     reliable, best = messages["reliable"], messages["best"]
     assert (reliable["sent"], reliable["received"], reliable["to_lost_agents"]) == (4, 3, 1)

@@ -32,9 +32,9 @@ from madns_runtime.recording.run_journal import RunJournal
 PAIR = StreamSchema("pair", (Field("number", "", "int"), Field("value_m", "m")))
 
 
-def make_recorder(directory, *, life=1, **values):
+def make_recorder(directory, *, incarnation=1, **values):
     chosen = Recording(**{"flush_interval_s": 0.05, **values})
-    files = RecordFiles(directory, run="0001-test", source="a", life=life)
+    files = RecordFiles(directory, run="0001-test", source="a", incarnation=incarnation)
     return Recorder(files, chosen)
 
 
@@ -108,7 +108,7 @@ def test_t0_line_is_no_record_in_the_counts(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("existing", "life", "expected"),
+    ("existing", "incarnation", "expected"),
     [
         ([], 1, "ticks.jsonl"),
         (["ticks.jsonl"], 1, "ticks.2.jsonl"),
@@ -117,10 +117,10 @@ def test_t0_line_is_no_record_in_the_counts(tmp_path):
         (["ticks.2.jsonl"], 2, "ticks.3.jsonl"),
     ],
 )
-def test_existing_file_is_left_alone(tmp_path, existing, life, expected):
+def test_existing_file_is_left_alone(tmp_path, existing, incarnation, expected):
     for name in existing:
         (tmp_path / name).write_text("precious")
-    recorder = make_recorder(tmp_path, life=life)
+    recorder = make_recorder(tmp_path, incarnation=incarnation)
     recorder.open_stream(TICKS)
     counts = recorder.close(30)
 

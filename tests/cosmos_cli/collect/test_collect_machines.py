@@ -282,10 +282,10 @@ def test_a_refusal_leaves_no_helper_behind(split, capsys, monkeypatch):
 
 
 def test_run_that_lives_in_many_processes_is_refused_in_one_short_line(split, capsys):
-    with contextlib.ExitStack() as lives:
+    with contextlib.ExitStack() as living:
         for number in range(3):
-            lives.enter_context(split.living("pi01", "agent", f"agent-{number}"))
-            lives.enter_context(split.living("pi02", "agent", f"agent-{number}"))
+            living.enter_context(split.living("pi01", "agent", f"agent-{number}"))
+            living.enter_context(split.living("pi02", "agent", f"agent-{number}"))
         code = app.run(["collect"])
 
     [line] = [line for line in capsys.readouterr().err.splitlines() if "still running" in line]

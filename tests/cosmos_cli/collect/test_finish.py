@@ -336,7 +336,7 @@ def test_later_incarnation_is_in_the_table_and_its_predecessor_is_named_as_cut(t
     assert "agents/agent-01/ticks.2.jsonl" in read(made.run.manifest_json)["files"]
 
 
-def test_life_that_ended_before_set_up_does_not_shift_the_numbers_of_the_next(tmp_path):
+def test_incarnation_that_ended_before_set_up_does_not_shift_the_numbers_of_the_next(tmp_path):
     made = SyntheticRun(tmp_path).write()
     for path in (made.run.path / "agents/agent-01").iterdir():
         path.unlink()

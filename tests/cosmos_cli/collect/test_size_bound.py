@@ -155,8 +155,8 @@ def test_bound_grows_with_what_the_plan_lets_a_machine_record():
     assert recordable_bytes(config, 3, is_host=False) - BASE_BYTES == 3 * one
     assert recordable_bytes(config, 0, is_host=True) - BASE_BYTES == 10 * one
     again = dataclasses.replace(config.agents, restarts_max=2)
-    lives = dataclasses.replace(config, agents=again)
-    assert recordable_bytes(lives, 1, is_host=False) - BASE_BYTES == 3 * one
+    restarted = dataclasses.replace(config, agents=again)
+    assert recordable_bytes(restarted, 1, is_host=False) - BASE_BYTES == 3 * one
 
 
 def test_sizes_up_to_the_bound_pass():

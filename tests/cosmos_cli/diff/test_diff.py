@@ -429,28 +429,28 @@ def test_settings_of_scenarios_need_scenarios(make, capsys):
     assert "--run" in capsys.readouterr().err
 
 
-def record_lives(made, *fields_of_lives):
-    """Record a stream in several lives of an agent, each with fields of its own."""
-    for life, names in enumerate(fields_of_lives):
+def record_incarnations(made, *fields_of_incarnations):
+    """Record a stream in several incarnations of an agent, each with fields of its own."""
+    for before, names in enumerate(fields_of_incarnations):
         fields = (Field("t_s", "s"), *(Field(name, "m") for name in names))
-        recorder = made.recorder("agents/agent-01", "agent-01", StreamSchema("lives", fields))
+        recorder = made.recorder("agents/agent-01", "agent-01", StreamSchema("restarted", fields))
         for second in range(3):
-            recorder.record("lives", (10.0 * life + second, *[1.0] * len(names)))
+            recorder.record("restarted", (10.0 * before + second, *[1.0] * len(names)))
         recorder.close()
 
 
-def test_a_field_that_one_life_alone_has_is_null_in_the_lines_of_the_other(make, capsys):
+def test_a_field_that_one_incarnation_alone_has_is_null_in_the_lines_of_the_other(make, capsys):
     """The table, in which it is null as well, was changed since: the lines are read."""
-    make(lambda made: record_lives(made, ("a_m",), ("a_m", "b_m")))
-    made = make(lambda made: record_lives(made, ("a_m",), ("a_m", "b_m")))
-    lines = made.run.path / "agents/agent-01/lives.jsonl"
+    make(lambda made: record_incarnations(made, ("a_m",), ("a_m", "b_m")))
+    made = make(lambda made: record_incarnations(made, ("a_m",), ("a_m", "b_m")))
+    lines = made.run.path / "agents/agent-01/restarted.jsonl"
     lines.write_text(lines.read_text().replace("[2.0,1.0]", "[2.0,4.0]"))
-    path = made.run.tables / "lives.parquet"
+    path = made.run.tables / "restarted.parquet"
     pq.write_table(pq.read_table(path), path)
 
-    code, document = diff(capsys, "1", "2", "--streams", "lives")
+    code, document = diff(capsys, "1", "2", "--streams", "restarted")
 
-    fields = streams_of(document)["lives"]["fields"]
+    fields = streams_of(document)["restarted"]["fields"]
     assert code == 0
     assert (fields["a_m"]["max"], fields["a_m"]["compared"]) == (3.0, 6)
     assert (fields["b_m"]["different"], fields["b_m"]["compared"]) == (0, 3)

@@ -21,17 +21,17 @@ def missing(made: SyntheticRun, **of_first_agent) -> list[str]:
     return find_missing(made.expected, scans, result)
 
 
-def renumber(folder: Path, life: int) -> None:
+def renumber(folder: Path, incarnation: int) -> None:
     for path in folder.glob("*.jsonl"):
-        path.rename(path.with_name(f"{path.stem}.{life}.jsonl"))
+        path.rename(path.with_name(f"{path.stem}.{incarnation}.jsonl"))
 
 
 @pytest.mark.parametrize(
     ("folder", "name"), [("agents/agent-01", "agent-01"), ("machines/loopback", "loopback")]
 )
-def test_life_that_left_nothing_is_missing_when_a_later_one_recorded(tmp_path, folder, name):
+def test_incarnation_that_left_nothing_is_missing_when_a_later_one_recorded(tmp_path, folder, name):
     made = SyntheticRun(tmp_path).write()
-    # The machine lost power before its disk had the first life's files, and returned.
+    # The machine lost power before its disk had the first incarnation's files, and returned.
     renumber(made.run.path / folder, 2)
 
     (line,) = missing(made)
@@ -78,7 +78,7 @@ def test_machine_that_runs_no_agent_owes_no_records(tmp_path):
     ("ended", "incarnations", "lines"),
     [([1], 1, 0), ([1], 2, 1), ([1, 2], 2, 0), ([1, 2], 3, 1), ([10**15], 1, 0), (["x", -3], 1, 0)],
 )
-def test_an_agent_that_returned_owes_the_records_of_its_last_life(
+def test_an_agent_that_returned_owes_the_records_of_its_last_incarnation(
     tmp_path, ended, incarnations, lines
 ):
     made = SyntheticRun(tmp_path).write()

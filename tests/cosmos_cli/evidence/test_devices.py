@@ -103,7 +103,7 @@ def test_a_device_without_an_account_is_not_taken_for_sound(
     assert not any(passed for _, passed, _ in judged(devices).values())
 
 
-def test_a_life_of_a_supervisor_without_account_is_a_loss(tmp_path: Path) -> None:
+def test_a_incarnation_of_a_supervisor_without_account_is_a_loss(tmp_path: Path) -> None:
     write(tmp_path, "devices.2.json", pi22_imu=SOUND, pi22_gps=SOUND)
 
     devices = read_devices(RunDirectory(tmp_path), PLAN, None)
@@ -160,7 +160,7 @@ PLAYED = {
 }
 
 
-def test_a_stimulus_is_judged_by_its_worst_output_over_all_lives(tmp_path: Path) -> None:
+def test_a_stimulus_is_judged_by_its_worst_output_over_all_incarnations(tmp_path: Path) -> None:
     stimulus = {"coil": PLAYED, "line": {**PLAYED, "late": 0, "skipped": 0, "lost": 0}}
     first = {**SOUND, "report": {**SOUND["report"], "stimulus": stimulus}}
     slower = {**PLAYED, "underruns": 0, "lateness_us": {"p50": 90, "p99": "\x1b", "max": 7}}
@@ -209,7 +209,7 @@ def test_what_found_no_room_between_devices_and_agents_is_remarked_once() -> Non
     )
 
 
-def test_an_input_that_gave_nothing_in_any_life_is_remarked_where_its_device_gave_samples(
+def test_an_input_that_gave_nothing_in_any_incarnation_is_remarked_where_its_device_gave_samples(
     tmp_path: Path,
 ) -> None:
     first = {**SOUND, "silent_inputs": ["field", "gyro"]}

@@ -56,7 +56,7 @@ def test_what_a_fault_took_from_an_agent_that_summed_nothing_up_is_lost_too():
     assert (counts["a"]["lost"], counts["b"]["lost"]) == (5, 65)
 
 
-def test_agent_that_came_back_has_lost_what_its_earlier_lives_lost_as_well():
+def test_agent_that_came_back_has_lost_what_its_earlier_incarnations_lost_as_well():
     own = {"service": "best", "lost": 1, "duplicated": 0, "out_of_order": 0}
     back = agent(own, best={"lost": 2}, agent={}, host={}) | {"incarnations": 2}
 

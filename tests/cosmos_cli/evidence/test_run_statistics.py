@@ -89,9 +89,9 @@ class Ticks:
 @pytest.mark.parametrize(("overrun_ms", "errors"), [(5.0, 2), (6.0, 1), (None, 0)])
 def test_steps_that_overran_before_a_restart_stay_counted(overrun_ms, errors):
     recorded = tick_statistics(Ticks(), overrun_ms).agents
-    last_life = {"a": {"due": 2, "run": 2, "overrun_errors": 0}}
+    last_incarnation = {"a": {"due": 2, "run": 2, "overrun_errors": 0}}
 
-    totals = tick_totals(recorded, last_life, agents=("a",), due_each=4)
+    totals = tick_totals(recorded, last_incarnation, agents=("a",), due_each=4)
 
     assert totals.overrun_errors == totals.agents["a"].overrun_errors == errors
 

@@ -325,8 +325,8 @@ def test_machine_that_returns_is_given_its_agents_again(fleet: Fleet, how: str) 
     assert "MACHINES FAILED: pi01: machine pi01 is lost" in fleet.verdict
     assert code == 3
     folder = fleet.directory / "agents" / "agent-01"
-    lives = sorted(path.name for path in folder.glob("ticks*.jsonl"))
-    assert lives == ["ticks.2.jsonl", "ticks.jsonl"]
+    streams = sorted(path.name for path in folder.glob("ticks*.jsonl"))
+    assert streams == ["ticks.2.jsonl", "ticks.jsonl"]
     health = fleet.directory / "machines" / "pi01"
     assert sorted(path.name for path in health.glob("health*.jsonl")) == [
         "health.2.jsonl",

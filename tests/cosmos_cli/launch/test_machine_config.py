@@ -21,7 +21,13 @@ from cosmos_cli.launch.preparation import (
     plan_mapping,
     with_address,
 )
-from cosmos_cli.launch.request import SYNC_INTERVAL_S, LaunchRequest, Life, MachineConfig, config_at
+from cosmos_cli.launch.request import (
+    SYNC_INTERVAL_S,
+    LaunchRequest,
+    MachineConfig,
+    SupervisorStart,
+    config_at,
+)
 from cosmos_cli.launch.restarts import Restarts
 from cosmos_cli.models.inventory import Machine, Variables
 from madns_runtime.config import Agents, Network, Recording, RunConfig
@@ -166,7 +172,9 @@ def test_launch_lines_speak_of_the_machines_own_places() -> None:
         "pi2",
         ("agent-01",),
         listening,
-        Life(number=2, incarnations={"agent-01": 3}, killed={"agent-01": 1}),
+        SupervisorStart(
+            incarnation=2, first_incarnations={"agent-01": 3}, killed_before={"agent-01": 1}
+        ),
     )
 
     assert (launch["host_address"], launch["host_port"]) == ("10.0.0.1", 4711)
@@ -255,28 +263,28 @@ def test_agents_that_were_ended_on_purpose_have_lost_no_start() -> None:
 
     assert made.restartable_on("pi2") == ("agent-01", "agent-03")
     assert made.left_on("pi2") == ("agent-01", "agent-03")
-    life = made.next_life_on("pi2")
-    assert life.incarnations == {"agent-01": 3, "agent-02": 2, "agent-03": 1}
-    assert life.killed == {"agent-01": 1, "agent-02": 1}
+    start = made.next_start_on("pi2")
+    assert start.first_incarnations == {"agent-01": 3, "agent-02": 2, "agent-03": 1}
+    assert start.killed_before == {"agent-01": 1, "agent-02": 1}
 
 
-def test_each_life_of_a_machine_counts_on_from_what_its_agents_had() -> None:
+def test_each_start_on_a_machine_counts_on_from_what_its_agents_had() -> None:
     made = roll(5)
     made.started("agent-01", 1)
     made.started("agent-01", 2)
 
-    first, second = made.next_life_on("pi2"), made.next_life_on("pi2")
+    first, second = made.next_start_on("pi2"), made.next_start_on("pi2")
 
-    assert (first.number, second.number) == (2, 3)
-    assert first.incarnations == {"agent-01": 3, "agent-02": 1, "agent-03": 1}
-    assert made.next_life_on("pi3").number == 2
+    assert (first.incarnation, second.incarnation) == (2, 3)
+    assert first.first_incarnations == {"agent-01": 3, "agent-02": 1, "agent-03": 1}
+    assert made.next_start_on("pi3").incarnation == 2
 
 
-def test_machine_on_which_nothing_starts_is_given_up_after_as_many_lives_as_an_agent_has() -> None:
+def test_machine_on_which_nothing_starts_is_given_up_after_as_many_starts_as_an_agent_has() -> None:
     made = roll(2)
     for _ in range(2):
         assert made.restartable_on("pi2")
-        made.next_life_on("pi2")
+        made.next_start_on("pi2")
 
     assert made.restartable_on("pi2") == ()
     assert made.restartable_on("pi3")

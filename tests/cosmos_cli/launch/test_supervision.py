@@ -15,7 +15,7 @@ from cosmos_cli.launch.actions import Action
 from cosmos_cli.launch.children import GROUP_GRACE_S, HOST, KILL_WAIT_S, TERM_GRACE_S
 from cosmos_cli.launch.host_limits import HOST_SILENCE_S, MARGIN_S
 from cosmos_cli.launch.machine_watch import REATTACH_INTERVAL_S, RETURN_INTERVAL_S, SILENCE_S
-from cosmos_cli.launch.request import LaunchRequest, Life
+from cosmos_cli.launch.request import LaunchRequest, SupervisorStart
 from cosmos_cli.launch.run_events import (
     Begun,
     ChildExited,
@@ -498,12 +498,12 @@ def test_machine_that_returns_is_given_its_agents_again() -> None:
     again += table.wait(RETURN_INTERVAL_S)
     back = table.play((0, MachineReached("pi01", is_reached=True)))
 
-    life = Life(number=2, incarnations={"agent-01": 2, "agent-02": 2})
+    start = SupervisorStart(incarnation=2, first_incarnations={"agent-01": 2, "agent-02": 2})
     assert again == [actions.ReachMachine("pi01")]
     assert back[0] == actions.Say(
         "pi01 has returned; its agents agent-01, agent-02 rejoin", "warning"
     )
-    assert back[1] == actions.StartAgents("pi01", ("agent-01", "agent-02"), LISTENING, life)
+    assert back[1] == actions.StartAgents("pi01", ("agent-01", "agent-02"), LISTENING, start)
     assert back[1].name == f"{AGENTS} (2)"
 
 
@@ -519,12 +519,12 @@ def test_machine_that_returns_is_given_agents_that_were_ended_on_purpose_and_wer
     table.play((0, started("agent-01", 2)), (1, ChildLost(AGENTS, "the connection broke")))
     back = table.play((0, MachineReached("pi01", is_reached=True)))
 
-    life = Life(
-        number=2,
-        incarnations={"agent-01": 3, "agent-02": 2},
-        killed={"agent-01": 1, "agent-02": 1},
+    start = SupervisorStart(
+        incarnation=2,
+        first_incarnations={"agent-01": 3, "agent-02": 2},
+        killed_before={"agent-01": 1, "agent-02": 1},
     )
-    assert back[1] == actions.StartAgents("pi01", ("agent-01",), LISTENING, life)
+    assert back[1] == actions.StartAgents("pi01", ("agent-01",), LISTENING, start)
 
 
 @pytest.mark.parametrize("is_lost", [False, True])

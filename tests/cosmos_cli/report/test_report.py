@@ -469,7 +469,7 @@ def test_pieces_are_thinned_by_themselves_with_a_break_between():
 def test_no_line_is_drawn_through_the_time_that_an_agent_was_away(tmp_path):
     made = SyntheticRun(tmp_path, make_config(1)).write(with_states=True)
     again = RecordFiles(
-        made.run.path / "agents/agent-01", run=made.run.name, source="agent-01", life=2
+        made.run.path / "agents/agent-01", run=made.run.name, source="agent-01", incarnation=2
     )
     recorder = Recorder(again, RECORDING)
     for schema in (STATE, ELEMENTS):
