@@ -118,7 +118,7 @@ class ReachMachine:
 
 
 @dataclass(frozen=True, slots=True)
-class OpenSeat:
+class OpenManualLine:
     """Wait for an agent that is started by hand, and tell how."""
 
     agent: str
@@ -127,7 +127,7 @@ class OpenSeat:
 
 
 @dataclass(frozen=True, slots=True)
-class SendSeat:
+class SendOnManualLine:
     """Send a command to an agent that was started by hand."""
 
     agent: str
@@ -135,15 +135,15 @@ class SendSeat:
 
 
 @dataclass(frozen=True, slots=True)
-class StopSeat:
-    """Let nobody take a seat any more."""
+class StopListening:
+    """Let no agent that is started by hand connect any more."""
 
     agent: str
 
 
 @dataclass(frozen=True, slots=True)
-class CloseSeat:
-    """Close a seat; who sits there sees its life line end."""
+class CloseManualLine:
+    """Close the line; an agent that is still connected sees its life line end."""
 
     agent: str
 
@@ -194,10 +194,10 @@ Action = (
     | FindLastCall
     | AskMachine
     | ReachMachine
-    | OpenSeat
-    | SendSeat
-    | StopSeat
-    | CloseSeat
+    | OpenManualLine
+    | SendOnManualLine
+    | StopListening
+    | CloseManualLine
     | AnswerOrder
     | Say
     | ReportProblem

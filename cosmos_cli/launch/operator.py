@@ -27,7 +27,7 @@ from cosmos_cli.launch.background import BackgroundTasks
 from cosmos_cli.launch.child import ChildProgram, LocalChild, RemoteProgram
 from cosmos_cli.launch.children import HOST
 from cosmos_cli.launch.machines import RemoteMachine
-from cosmos_cli.launch.manual_seat import ManualSeat
+from cosmos_cli.launch.manual_line import ManualLine
 from cosmos_cli.launch.order_socket import SelectorReaders
 from cosmos_cli.launch.remote_child import RemoteChild
 from cosmos_cli.launch.reporter import Reporter
@@ -100,7 +100,7 @@ class Operator:
         # waits for a processor, none of the operator's limits comes closer.
         self._now_s = GrantedClock(self._living).now_s if self._is_lockstep else time.monotonic
         self._exited: set[str] = set()
-        self._seats: dict[str, ManualSeat] = {}
+        self._manual_lines: dict[str, ManualLine] = {}
         self._orders: OrderSocket | None = None
         self._events: deque[RunEvent] = deque()
         self._is_handling = False
@@ -120,10 +120,12 @@ class Operator:
             actions.FindLastCall: self._find_last_call,
             actions.AskMachine: self._ask_machine,
             actions.ReachMachine: self._reach_machine,
-            actions.OpenSeat: self._open_seat,
-            actions.SendSeat: lambda action: self._seats[action.agent].send(action.command),
-            actions.StopSeat: lambda action: self._seats[action.agent].stop_listening(),
-            actions.CloseSeat: lambda action: self._seats.pop(action.agent).close(),
+            actions.OpenManualLine: self._open_manual_line,
+            actions.SendOnManualLine: lambda action: self._manual_lines[action.agent].send(
+                action.command
+            ),
+            actions.StopListening: lambda action: self._manual_lines[action.agent].stop_listening(),
+            actions.CloseManualLine: lambda action: self._manual_lines.pop(action.agent).close(),
             actions.AnswerOrder: self._answer_order,
             actions.Say: lambda action: self._view.say(action.text, action.level),
             actions.ReportProblem: lambda a: self._reporter.problem(a.text, a.machine),
@@ -214,8 +216,8 @@ class Operator:
 
     def _clear_up(self) -> tuple[int, ...]:
         """End whatever lives, outside of the loop: the last resort, also when the loop itself has failed."""
-        for seat in self._seats.values():
-            seat.close()
+        for line in self._manual_lines.values():
+            line.close()
         self._carry_out(self._supervision.stop_seeking())
         children = tuple(self._children.values())
         with ThreadPoolExecutor(max(1, len(children))) as pool:
@@ -369,9 +371,9 @@ class Operator:
             ),
         )
 
-    def _open_seat(self, action: actions.OpenSeat) -> None:
+    def _open_manual_line(self, action: actions.OpenManualLine) -> None:
         agent = action.agent
-        seat = self._seats[agent] = ManualSeat(
+        line = self._manual_lines[agent] = ManualLine(
             agent,
             self._selector,
             launch=self._request.agent_launch(action.machine, (agent,), action.listening),
@@ -381,7 +383,7 @@ class Operator:
             ),
         )
         try:
-            command = seat.open()
+            command = line.open()
         except OSError as error:
             self._post(happened.StartFailed(agent, None, f"no socket for it: {error}"))
             return

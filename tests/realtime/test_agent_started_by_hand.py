@@ -15,7 +15,7 @@ PATIENCE_S = 60.0
 
 
 @pytest.mark.parametrize("folder", ["short", "long" * 50])
-def test_second_one_for_a_seat_is_told_that_it_is_taken(tmp_path, folder):
+def test_second_one_for_an_agent_is_told_that_its_place_is_taken(tmp_path, folder):
     (tmp_path / folder).mkdir()
     with private_socket.listen(tmp_path / folder, "launch", 1) as listener:
         path = str(tmp_path / folder / "launch")

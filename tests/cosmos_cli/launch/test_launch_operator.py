@@ -536,7 +536,7 @@ def test_manual_agent_for_whom_there_is_no_socket_ends_the_run_and_is_named(
     launched: Launched,
 ) -> None:
     launched.start(
-        host={"runs_s": 60}, manual="agent-02", constants={"manual_seat.FOLDER_PREFIX": "no/such/"}
+        host={"runs_s": 60}, manual="agent-02", constants={"manual_line.FOLDER_PREFIX": "no/such/"}
     )
 
     outcome = launched.outcome()

@@ -368,11 +368,11 @@ def test_interrupted_run_is_not_left() -> None:
 # Agents started by hand -------------------------------------------------------------------------------
 
 
-def test_seat_of_an_agent_that_left_early_is_told_to_the_host_and_stays_open() -> None:
+def test_line_of_an_agent_that_left_early_is_told_to_the_host_and_stays_open() -> None:
     table = Table(remote=(), manual=("agent-02",))
     table.run()
-    assert of_kind(table.done, actions.OpenSeat) == [
-        actions.OpenSeat("agent-02", "pi01", LISTENING)
+    assert of_kind(table.done, actions.OpenManualLine) == [
+        actions.OpenManualLine("agent-02", "pi01", LISTENING)
     ]
 
     left = table.play(
@@ -380,10 +380,10 @@ def test_seat_of_an_agent_that_left_early_is_told_to_the_host_and_stays_open() -
     )
 
     assert [command["agent"] for command in told(left, HOST)] == ["agent-02"]
-    assert of_kind(left, actions.CloseSeat) == []
+    assert of_kind(left, actions.CloseManualLine) == []
 
 
-def test_seat_that_is_still_taken_is_closed_after_a_while() -> None:
+def test_line_of_an_agent_that_is_still_connected_is_closed_after_a_while() -> None:
     table = Table(remote=(), manual=("agent-02",))
     table.run()
     table.play((0, happened.ManualAgentJoined("agent-02")))
@@ -391,13 +391,13 @@ def test_seat_that_is_still_taken_is_closed_after_a_while() -> None:
     finished = table.play((0, ChildSaid(HOST, events.Finished({"status": "complete"}))))
     late = table.wait(STOP_GRACE_S + TIMEOUTS.shutdown_s + END_MARGIN_S)
 
-    assert actions.StopSeat("agent-02") in finished
-    assert of_kind(finished, actions.CloseSeat) == []
-    assert of_kind(late, actions.SendSeat)[0].agent == "agent-02"
+    assert actions.StopListening("agent-02") in finished
+    assert of_kind(finished, actions.CloseManualLine) == []
+    assert of_kind(late, actions.SendOnManualLine)[0].agent == "agent-02"
     assert "agent-02, started by hand, is still connected: its line is being closed" in problems(
         late
     )
-    assert of_kind(late, actions.CloseSeat) == [actions.CloseSeat("agent-02")]
+    assert of_kind(late, actions.CloseManualLine) == [actions.CloseManualLine("agent-02")]
 
 
 # Machines ---------------------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
 """
-A seat for an agent that a person starts by hand, on a terminal or in a debugger.
+The line to an agent that a person starts by hand, on a terminal or in a debugger.
 
 A unix socket in a private folder stands in for the pipes of a started child: whoever connects gets the
 launch line, which holds the run key, so only the same user may.
@@ -24,9 +24,9 @@ BACKLOG = 4
 FOLDER_PREFIX = "cosmos-"
 
 
-class ManualSeat:
+class ManualLine:
     """
-    Waits for one hand-started agent at a time; after it has gone, another may take the seat.
+    Waits for one hand-started agent at a time; after it has gone, another may connect.
 
     Args:
         agent: Its name.
