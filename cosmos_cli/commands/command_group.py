@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ast
 import copy
-import difflib
 import gc
 import importlib
 import importlib.util
@@ -22,6 +21,7 @@ import typer.core
 
 from cosmos_cli.models.inventory_arguments import split_variable
 from cosmos_cli.ui import invocation, step_times
+from madns_runtime.similar_words import most_similar
 
 COMMANDS = (
     "init",
@@ -99,8 +99,8 @@ class LazyGroup(typer.core.TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command that is meant; typer looks for similar names among loaded ones only."""
         if args and args[0] not in self.verbs and not args[0].startswith("-"):
-            close = difflib.get_close_matches(args[0], self.verbs, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(self.verbs)}"
+            close = most_similar(args[0], self.verbs)
+            hint = f"did you mean {close}?" if close else f"there are {', '.join(self.verbs)}"
             raise USAGE_ERROR(f"no command {self.prefix + args[0]!r}; {hint}", ctx)
         return super().resolve_command(ctx, args)
 

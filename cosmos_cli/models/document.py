@@ -6,7 +6,6 @@ What other modules put into it keeps the place where it was written: another fil
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from typing import Any
 
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
 from cosmos_cli.models.yaml_source import DEPTH_MAX, Node, YamlSource, compose
+from madns_runtime import similar_words
 
 VALUES_MAX = 200_000
 """Bound of the values that a document may unfold to: aliases of aliases grow without end."""
@@ -274,7 +274,5 @@ def may_guess(faults: int, known: int) -> bool:
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:
     """Return `, did you mean X?` or the list of what is known."""
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
-    if close:
-        return f", did you mean {close[0]}?"
-    return f"; known here: {', '.join(known)}" if known else ""
+    guess = similar_words.did_you_mean(word, known)
+    return guess or (f"; known here: {', '.join(known)}" if known else "")

@@ -8,7 +8,6 @@ without a bound: a file of 200,000 brackets would end the process.
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ import yaml
 
 from cosmos_cli.errors import Fault, InputError, check_path_is_text
 from madns_runtime.bounded_files import FileRefused, read_regular_file
+from madns_runtime.similar_words import most_similar
 
 FILE_BYTES_MAX = 4 * 1024 * 1024
 DEPTH_MAX = 64
@@ -166,8 +166,8 @@ def _similar(path: Path) -> str:
         names = [entry.name for entry in path.parent.iterdir()]
     except OSError:
         return ""
-    close = difflib.get_close_matches(path.name, names, n=1)
-    return f", did you mean {path.parent / close[0]}?" if close else ""
+    close = most_similar(path.name, names)
+    return "" if close is None else f", did you mean {path.parent / close}?"
 
 
 def compose(source: YamlSource, *, has_64_bits: bool = True) -> Node | None:

@@ -15,8 +15,8 @@ from typing import Any, Final, get_type_hints
 
 import orjson
 
+from madns_runtime.declared_bounds import bound_faults
 from madns_runtime.errors import ConfigurationError, MadnsError
-from madns_runtime.hardware.bounds import bound_faults
 from madns_runtime.hardware.fault_actions import check_fault
 from madns_runtime.hardware.order_socket import LineSocket, Readers
 from madns_runtime.plain_values import from_mapping, is_real, shown, to_mapping

@@ -7,15 +7,14 @@ A kind is registered by the entry point `madns.devices`, or named as `module:NAM
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from madns_runtime.declared_bounds import bound_faults
 from madns_runtime.errors import ConfigurationError, MachineError, PluginError
-from madns_runtime.hardware.bounds import bound_faults
 from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Needs, SimulatedDevice
 from madns_runtime.hardware.kind_declaration import (
     channel_faults,
@@ -28,6 +27,7 @@ from madns_runtime.plugin.code_places import told_place
 from madns_runtime.plugin.entry_points import place_of_name, registered
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_object
+from madns_runtime.similar_words import did_you_mean
 
 GROUP: Final = "madns.devices"
 
@@ -65,10 +65,10 @@ def resolve_kind(spec: str, base_directory: Path) -> DeviceKind:
     if ":" not in spec:
         entries = registered(GROUP)
         if spec not in entries:
-            close = difflib.get_close_matches(spec, entries, n=1)
-            hint = f", did you mean {close[0]}?" if close else ""
             known = ", ".join(sorted(entries)) or "none"
-            raise PluginError(f"no kind of device named {spec!r}{hint}; installed are {known}")
+            raise PluginError(
+                f"no kind of device named {spec!r}{did_you_mean(spec, entries)}; installed are {known}"
+            )
         where = place_of_name(GROUP, spec)
     module, found = load_object(where, base_directory)
     kind = getattr(found, "kind", None) if isinstance(found, type) else found

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import hashlib
 import importlib
 import importlib.util
@@ -42,6 +41,7 @@ from madns_runtime.plugin.entry_points import place_of_name, registered
 from madns_runtime.plugin.isolation import is_interruption, missing_extra, said
 from madns_runtime.plugin.time_limit import hold
 from madns_runtime.reactor.forking import CAME_BACK, generation
+from madns_runtime.similar_words import did_you_mean
 
 GROUP = "madns.simulations"
 PARTS = (
@@ -206,10 +206,7 @@ def parse_parameters(descriptor: Simulation, mapping: Mapping[str, Any]) -> Any:
 
 
 def _unknown_name(spec: str, known: list[str], base_directory: Path) -> str:
-    text = f"no simulation named {spec!r}"
-    close = difflib.get_close_matches(spec, known, n=1)
-    if close:
-        text += f", did you mean {close[0]}?"
+    text = f"no simulation named {spec!r}{did_you_mean(spec, known)}"
     if spec.endswith(".py") or (base_directory / f"{spec}.py").is_file():
         path = spec if spec.endswith(".py") else f"{spec}.py"
         path = path if path.startswith((".", "/")) else f"./{path}"
@@ -323,8 +320,7 @@ def _attribute(module: ModuleType, name: str, where: str) -> Any:
         return getattr(module, name)
     except AttributeError:
         public = [key for key in vars(module) if not key.startswith("_")]
-        close = difflib.get_close_matches(name, public, n=1)
-        hint = f", did you mean {close[0]}?" if close else ""
+        hint = did_you_mean(name, public)
         if where.startswith(MODULE_PREFIX):
             raise PluginError(f"{told_place(where)}: there is no {name!r}{hint}") from None
         file = getattr(module, "__file__", None) or module.__name__

@@ -6,7 +6,6 @@ As in `check`, standard library alone: `cosmos validate` answers at once.
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Final
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.plain_values import first_few
 from madns_runtime.plugin.api import PlannedAction
+from madns_runtime.similar_words import did_you_mean
 from madns_runtime.simulations.constellation.actions import (
     DARKEN_STATION,
     FAIL_WHEELS,
@@ -199,5 +199,4 @@ _RULES: Final[Mapping[str, Callable[[_Fleet, PlannedAction], Found]]] = {
 
 
 def _meant(name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1)
-    return f", did you mean {close[0]}?" if close else f"; there are {', '.join(known)}"
+    return did_you_mean(name, known) or f"; there are {', '.join(known)}"
