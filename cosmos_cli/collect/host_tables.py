@@ -26,13 +26,12 @@ from cosmos_cli.evidence.streams import RecordFile
 from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.evidence.tables import TableLayout, TableWriter
 from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
-from cosmos_cli.ui.plural import counted
 from madns_runtime import errors as runtime_errors
 from madns_runtime.analysis.field_checks import real_array
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError, MissingExtraError, PluginError
 from madns_runtime.partial_file import check_replaceable, remove_partial
-from madns_runtime.plain_values import shown
+from madns_runtime.plain_values import first_few, shown
 from madns_runtime.plugin.api import Tabulated
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.descriptor_faults import COLUMNS_OF_TABLES
@@ -238,11 +237,11 @@ def _parts(
 def _missing(told: Mapping[str, int], agents: tuple[str, ...], times_s: Times) -> str | None:
     """Return whose rows are not there, or not all; *told* has how many there are."""
     if missing := [agent for agent in agents if agent not in told]:
-        return f"yielded no rows of {_some_of(missing)}"
+        return f"yielded no rows of {first_few(missing, NAMES_MAX)}"
     if short := [agent for agent in agents if told[agent] < len(times_s)]:
         return (
             f"must yield a row for each of {len(times_s)} times, with NaN where nothing is on record;"
-            f" yielded {told[short[0]]} of {_some_of(short)}"
+            f" yielded {told[short[0]]} of {first_few(short, NAMES_MAX)}"
         )
     return None
 
@@ -257,11 +256,6 @@ def _fault_of_times(part: Tabulated, told: Mapping[str, int], times_s: Times) ->
         if first < len(times_s)
         else f"yielded more rows of {part.agent} than the {len(times_s)} times that it is asked for"
     )
-
-
-def _some_of(names: list[str]) -> str:
-    rest = len(names) - NAMES_MAX
-    return ", ".join(names[:NAMES_MAX]) + (f" and {counted(rest, 'other')}" if rest > 0 else "")
 
 
 def _fault_of(part: Any, fields: tuple[Field, ...] | None, agents: tuple[str, ...]) -> str | None:

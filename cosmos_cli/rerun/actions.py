@@ -13,6 +13,7 @@ from cosmos_cli.report.timeline import ActionTold, read_actions
 from cosmos_cli.rerun.carried_over import is_stand_in
 from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.plural import counted
+from madns_runtime.plain_values import first_few
 from madns_runtime.timeline.kinds import DEVICE_FAULT, STOP
 
 SHOWN_MAX: Final = 5
@@ -63,12 +64,10 @@ def _key(action: ActionTold) -> tuple[str, tuple[str, ...], bytes]:
 
 
 def _told(alone: Sequence[ActionTold], where: str) -> str:
-    shown = "; ".join(
+    lines = [
         clean_line(f"{each.what} {each.whom}".rstrip() + f" at {each.begin_s:g} s")
-        for each in alone[:SHOWN_MAX]
-    )
-    more = len(alone) - SHOWN_MAX
+        for each in alone
+    ]
     why = ", ordered live or by a condition" if where == "on record" else ""
-    return f"{counted(len(alone), 'action')} only {where}{why}: {shown}" + (
-        f" and {more} more" if more > 0 else ""
-    )
+    shown = first_few(lines, SHOWN_MAX, "; ")
+    return f"{counted(len(alone), 'action')} only {where}{why}: {shown}"

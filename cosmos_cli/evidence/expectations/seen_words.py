@@ -11,7 +11,7 @@ from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.expectation import Expectation
 from cosmos_cli.models.known_streams import WORDS
 from cosmos_cli.ui.foreign_text import clean_line
-from cosmos_cli.ui.plural import counted
+from madns_runtime.plain_values import first_few
 
 KEPT_MAX: Final = 1000
 """Different words that are kept of one stream; of more, such as sentences, the first."""
@@ -58,10 +58,10 @@ class SeenWords:
         words = sorted(clean_line(word, length_max=CHARACTERS_MAX) for word in self._words)
         guess = did_you_mean(self._word, words)
         if not guess.endswith("?"):
-            rest = len(words) - TOLD_MAX
-            others = "others" if len(words) == KEPT_MAX else counted(rest, "other")
-            more = f" and {others}" if rest > 0 else ""
-            guess = f"; words seen: {', '.join(words[:TOLD_MAX])}{more}"
+            seen = first_few(words, TOLD_MAX)
+            if len(words) == KEPT_MAX:  # how many there were is not known
+                seen = f"{', '.join(words[:TOLD_MAX])} and more"
+            guess = f"; words seen: {seen}"
         return (
             f"{expectation.name}: no record of {expectation.stream} has {self._word!r:.80}"
             f" in {expectation.field}{guess}"

@@ -11,6 +11,7 @@ from cosmos_cli.models.expectation import Expectation
 from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.plural import counted
 from madns_runtime.conditions.condition import HOST
+from madns_runtime.plain_values import first_few
 
 KEPT_MAX: Final = 1000
 """Different names that are kept of one stream."""
@@ -57,11 +58,7 @@ class Strangers:
             records = counts.total() + self._more[stream]
             names = [clean_line(name, length_max=CHARACTERS_MAX) for name in sorted(counts)]
             yield (
-                f"stream {stream}: {counted(records, 'record')} about {_first_of(names)}, which are no agents of"
-                f" the run, are not judged by {_first_of(checks)}; agents: [host] judges every record"
+                f"stream {stream}: {counted(records, 'record')} about {first_few(names, TOLD_MAX)}, which are no"
+                f" agents of the run, are not judged by {first_few(checks, TOLD_MAX)}; agents: [host] judges every"
+                " record"
             )
-
-
-def _first_of(names: Sequence[str]) -> str:
-    more = len(names) - TOLD_MAX
-    return ", ".join(names[:TOLD_MAX]) + (f" and {counted(more, 'other')}" if more > 0 else "")

@@ -99,7 +99,7 @@ def test_of_very_many_agents_without_rows_the_first_are_named(tmp_path):
     row = "times_s[agents.index(agent) :][:1]"
     change = f"{{'agent': 'agent-000', 'times_s': {row}, 'columns': {{'x_m': {row}}}}}"
 
-    with pytest.raises(PluginError, match=r"no rows of agent-001, .*agent-010 and 489 others$"):
+    with pytest.raises(PluginError, match=r"no rows of agent-001, .*agent-010 and 489 more$"):
         rows(tmp_path, change, agents)
 
 
