@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -34,9 +34,11 @@ __all__ = [
     "failure_teller",
     "finish",
     "fleet_of",
+    "row_teller",
     "some_machines",
 ]
 
+T = TypeVar("T")
 TIMEOUT_S_MAX = 1e6
 """Of any --timeout, eleven days: the kernel's waits end at twenty-four."""
 
@@ -132,6 +134,18 @@ def failure_teller(console: Console) -> Callable[[Outcome[Any]], None]:
     def tell(outcome: Outcome[Any]) -> None:
         if outcome.failure is not None:
             console.say(f"{outcome.machine}: failed: {outcome.failure}")
+
+    return tell
+
+
+def row_teller(
+    console: Console, fleet: Fleet, words: Callable[[Outcome[T]], str]
+) -> Callable[[Outcome[T]], None]:
+    """Return a function that prints a machine's name and the *words* about its outcome, aligned with other machines."""
+    width = max((len(target.name) for target in fleet.targets), default=0)
+
+    def tell(outcome: Outcome[T]) -> None:
+        console.data(f"{outcome.machine:<{width}}  {words(outcome)}")
 
     return tell
 

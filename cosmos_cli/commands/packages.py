@@ -19,6 +19,7 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     finish,
     fleet_of,
+    row_teller,
     without_this_computer,
 )
 from cosmos_cli.errors import InputError
@@ -138,12 +139,7 @@ def _change(
         "is_check": is_check,
         "timeout_s": timeout_s,
     }
-    width = max((len(target.name) for target in fleet.targets), default=0)
-
-    def tell(outcome: Outcome[Changed]) -> None:
-        console.data(f"{outcome.machine:<{width}}  {_words(outcome)}")
-
-    in_order = InOrder(fleet.targets, tell)
+    in_order = InOrder(fleet.targets, row_teller(console, fleet, _words))
     return fleet.each_target(
         lambda connection: _change_one(connection, arguments), in_order, in_order.wait
     )

@@ -17,6 +17,7 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     finish,
     fleet_of,
+    row_teller,
     without_this_computer,
 )
 from cosmos_cli.errors import InputError
@@ -106,12 +107,7 @@ def _reboot(
         options=fleet.options,
         connect=connect,
     )
-    width = max(len(target.name) for target in fleet.targets)
-
-    def tell(outcome: Outcome[Rebooted]) -> None:
-        console.data(f"{outcome.machine:<{width}}  {_words(outcome)}")
-
-    return fleet.each_target(rebooting.reboot, tell)
+    return fleet.each_target(rebooting.reboot, row_teller(console, fleet, _words))
 
 
 def _words(outcome: Outcome[Rebooted]) -> str:

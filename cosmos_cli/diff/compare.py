@@ -18,6 +18,7 @@ from cosmos_cli.diff.stream import (
 )
 from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.simulation_calls import call_simulation, check_blocks, json_document
+from cosmos_cli.evidence.streams import file_size_bytes
 from cosmos_cli.evidence.tables import no_tables, open_recorded_run
 from cosmos_cli.evidence.verdict import is_number
 from madns_runtime.analysis.tables import ComparedRun
@@ -292,13 +293,7 @@ def _fits(name: str, globs: Sequence[str]) -> bool:
 
 def _size(recorded: Recorded) -> int:
     """Return the bytes of a stream's lines; a stream without lines counts little."""
-    size = 1
-    for file in recorded.files:
-        try:
-            size += file.path.stat().st_size
-        except OSError:
-            continue
-    return size
+    return 1 + sum(file_size_bytes(file.path) for file in recorded.files)
 
 
 def differing_keys(

@@ -149,6 +149,14 @@ def find_streams(run_path: Path, runs: Collection[str] = ()) -> list[RecordFile]
     return sorted(found, key=_order)
 
 
+def file_size_bytes(path: Path) -> int:
+    """Return the bytes of a file; 0 where it is gone or cannot be looked at."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
 def is_linked(path: Path, run_path: Path) -> bool:
     """Tell whether a file, or a folder between it and the run's, is a link."""
     inner = itertools.takewhile(lambda folder: folder != run_path, path.parents)

@@ -18,6 +18,7 @@ from cosmos_cli.evidence.streams import (
     Columns,
     RecordFile,
     StreamScan,
+    file_size_bytes,
     find_streams,
     scan_stream,
 )
@@ -94,12 +95,12 @@ class _Done:
     """Turns files read into progress, weighed by their size."""
 
     def __init__(self, files: Sequence[RecordFile], progress: Progress) -> None:
-        self._total = max(sum(_size(file.path) for file in files), 1)
+        self._total = max(sum(file_size_bytes(file.path) for file in files), 1)
         self._read = 0
         self._progress = progress
 
     def add(self, file: RecordFile) -> None:
-        self._read += _size(file.path)
+        self._read += file_size_bytes(file.path)
         self._progress(f"reading {file.label}", min(self._read / self._total, 1.0))
 
 
@@ -152,10 +153,3 @@ class _Table:
             if self._writer is not None:
                 self._writer.abandon()
             self._writer = None
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return 0

@@ -14,6 +14,7 @@ from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.completeness import ended_on_purpose
 from cosmos_cli.evidence.devices import expected_devices
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.streams import file_size_bytes
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.config import RunConfig
@@ -166,7 +167,7 @@ def _read_agent(folder: Path, config: RunConfig, *, is_killed: bool) -> Recorded
         raise InputError(
             f"{name} was lost and started anew, which lockstep cannot repeat; rerun a run in which it lived"
         )
-    if is_killed and _size(ticks) == 0:
+    if is_killed and file_size_bytes(ticks) == 0:
         return _without_ticks(config)
     try:
         stream = read_stream(ticks)
@@ -195,13 +196,6 @@ def _without_ticks(config: RunConfig) -> RecordedAgent:
     """Return an agent that wrote no tick: its last one would have come before time zero."""
     last_s = -1.0 / config.agents.tick_hz
     return RecordedAgent(ticks=None, last_s=last_s, last_wake_s=last_s)
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return 0
 
 
 def _is_tick(row: object) -> bool:
