@@ -16,7 +16,6 @@ from cosmos_cli.diff.stream import (
     diff_stream,
     identical_stream,
 )
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.simulation_calls import call_simulation, check_blocks, json_document
 from cosmos_cli.evidence.streams import file_size_bytes
 from cosmos_cli.evidence.tables import no_tables, open_recorded_run
@@ -24,6 +23,7 @@ from cosmos_cli.evidence.verdict import is_number
 from madns_runtime.analysis.tables import ComparedRun
 from madns_runtime.analysis.values import SimulationDifference
 from madns_runtime.errors import PluginError
+from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.records import FRAMEWORK_STREAMS
 
 Progress = Callable[[str, float], None]

@@ -16,7 +16,6 @@ import numpy as np
 from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.unread_files import find_unread
 from cosmos_cli.errors import InputError
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.manifest import file_entry
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import (
@@ -29,6 +28,7 @@ from cosmos_cli.evidence.streams import (
 )
 from cosmos_cli.evidence.tables import TableReader, open_tables
 from madns_runtime.errors import MachineError
+from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.reader import StreamReading
 from madns_runtime.recording.records import Field
 

@@ -10,11 +10,11 @@ from cosmos_cli.collect.finished_run import collected_document, refuse_foreign_t
 from cosmos_cli.collect.previous_manifest import Earlier, is_there
 from cosmos_cli.diff.recorded import Key, Recorded, recorded_streams
 from cosmos_cli.errors import InputError
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import SUFFIX
 from cosmos_cli.evidence.verdict import is_number
 from madns_runtime.config import to_mapping
+from madns_runtime.plain_values import mapping_at
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

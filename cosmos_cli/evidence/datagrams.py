@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from cosmos_cli.evidence.completeness import COUNT_MAX, NOTHING, mapping_at
+from cosmos_cli.evidence.completeness import COUNT_MAX, NOTHING
+from madns_runtime.plain_values import mapping_at
 
 SERVICES = ("best", "reliable", "sync")
 OWN_NAMES = ("lost", "duplicated", "out_of_order")

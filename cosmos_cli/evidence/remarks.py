@@ -11,7 +11,6 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.plugin_checks import check_fault, listed_checks
 from cosmos_cli.evidence.streams import StreamScan
 from cosmos_cli.evidence.verdict import is_number
@@ -21,6 +20,7 @@ from madns_runtime.config import from_mapping
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.medium.carrier import KEPT_MAX
 from madns_runtime.medium.mailbox import HELD_MAX
+from madns_runtime.plain_values import mapping_at
 from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.protocol.link_settings import LinkLimits
 from madns_runtime.protocol.sending import MESSAGES_QUEUED_MAX

@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from cosmos_cli.evidence.completeness import is_excused, mapping_at
+from cosmos_cli.evidence.completeness import is_excused
 from cosmos_cli.evidence.datagrams import SERVICES, whole_count
 from cosmos_cli.evidence.streams import StreamScan
 from madns_runtime.analysis.distribution import Distribution, Summary, rounded
 from madns_runtime.analysis.tables import RecordedTable, Tables
+from madns_runtime.plain_values import mapping_at
 
 US_PER_MS = 1000.0
 LOST = "lost"

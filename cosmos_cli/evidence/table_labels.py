@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.models.agent_labels import NO_LABELS as AGENTS_UNLABELLED
 from cosmos_cli.models.agent_labels import AgentLabels
 from madns_runtime.config import RunConfig, from_mapping
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.plain_values import mapping_at
 
 EPOCH = "epoch_utc"
 LOCKSTEP_ZERO_UTC = "1970-01-01T00:00:00Z"

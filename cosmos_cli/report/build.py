@@ -8,7 +8,6 @@ from operator import itemgetter
 from pathlib import PurePosixPath
 from typing import Any
 
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.datagrams import WORDS
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import fault_of_plan
@@ -38,6 +37,7 @@ from madns_runtime.analysis.tables import RecordedRun, RecordedTable, Tables
 from madns_runtime.analysis.values import Heading, ReportRemark, Section, TableBlock, headings
 from madns_runtime.conditions.condition import HOST
 from madns_runtime.errors import PluginError
+from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.records import CLOCK, HEALTH, LATE_TICKS, PROCESS, TICKS
 
 SENTENCES_MAX = 60

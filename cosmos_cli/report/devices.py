@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.report.device_temperature import temperature_blocks
 from madns_runtime.analysis.tables import RecordedRun
 from madns_runtime.analysis.values import Heading, Section, TableBlock
+from madns_runtime.plain_values import mapping_at
 
 COLUMNS = {
     "status": "status",

@@ -21,7 +21,6 @@ import orjson
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.report.build import build_sections, figures_of
 from cosmos_cli.report.cells import format_cell, format_measured
@@ -39,6 +38,7 @@ from madns_runtime.analysis.values import (
 )
 from madns_runtime.errors import MissingExtraError
 from madns_runtime.partial_file import write_whole
+from madns_runtime.plain_values import mapping_at
 
 if TYPE_CHECKING:
     import jinja2

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.report.build import figures_of
 from cosmos_cli.report.cells import format_cell, format_measured
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.analysis.values import ReportRemark, Section, TableBlock
+from madns_runtime.plain_values import mapping_at
 
 CHECK_COLUMNS = (
     Column("check"),

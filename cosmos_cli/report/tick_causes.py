@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from cosmos_cli.evidence.completeness import mapping_at
 from cosmos_cli.evidence.datagrams import whole_count
 from cosmos_cli.evidence.tick_causes import TOLD_CAUSES, WORDS, recorded_causes
 from cosmos_cli.report.timing import reached_s
@@ -24,6 +23,7 @@ from madns_runtime.analysis.values import (
     Tone,
     headings,
 )
+from madns_runtime.plain_values import mapping_at
 
 TIME_BINS = 60
 DRAWN_CAUSES_MAX = 4
