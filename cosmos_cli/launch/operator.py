@@ -237,7 +237,7 @@ class Operator:
             self._post(happened.Signalled(number))
 
     def _listen_for_orders(self) -> None:
-        """Open the door for faults that are to be inserted, where a run has devices that take them."""
+        """Open the socket for faults that are to be inserted, where a run has devices that take them."""
         is_hosts = self._request.is_detached  # it goes on when this process leaves
         if self._is_lockstep or is_hosts or not any(self._request.devices.values()):
             return

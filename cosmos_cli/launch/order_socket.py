@@ -1,4 +1,4 @@
-"""Orders to a living run, through the door that its operator, or of a detached run its host, has open."""
+"""Orders to a living run, over a socket of its operator or its host (`madns_runtime.hardware.order_socket`)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ANSWER_S = 10.0
 
 
 class SelectorReaders:
-    """The operator's loop, as the door of a run wants it."""
+    """The operator's loop, with the methods that a run's socket needs."""
 
     def __init__(self, selector: selectors.BaseSelector) -> None:
         self._selector = selector
@@ -54,7 +54,7 @@ def order_fault(folder: Path, name: str, fault: Fault) -> str:
     """
     order = dict(zip(("target", "action", "value"), fault, strict=True))
     why_not = "it has ended, has no devices, or its host runs on another computer"
-    return _refusal_in(_knock(folder / SOCKET_NAME, name, order, why_not))
+    return _refusal_in(_exchange(folder / SOCKET_NAME, name, order, why_not))
 
 
 def order_action(folder: Path, name: str, order: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -71,22 +71,26 @@ def order_action(folder: Path, name: str, order: Mapping[str, Any]) -> Mapping[s
         RunFailedError: It does not answer in time.
     """
     why_not = "it has not begun, has ended, or its host runs on another computer"
-    return _knock(folder / ACTIONS_SOCKET, name, order, why_not)
+    return _exchange(folder / ACTIONS_SOCKET, name, order, why_not)
 
 
-def _knock(door: Path, name: str, order: Mapping[str, Any], why_not: str) -> Mapping[str, Any]:
+def _exchange(
+    socket_path: Path, name: str, order: Mapping[str, Any], why_not: str
+) -> Mapping[str, Any]:
     line = _line_of(order, name)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as visit:
-        visit.settimeout(ANSWER_S)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(ANSWER_S)
         try:
-            with private_socket.socket_address(door.parent.resolve(), door.name) as path:
+            with private_socket.socket_address(
+                socket_path.parent.resolve(), socket_path.name
+            ) as path:
                 if not stat.S_ISSOCK(os.lstat(path).st_mode):
                     raise FileNotFoundError(path)
-                visit.connect(path)
+                connection.connect(path)
         except OSError:
             raise InputError(f"{name}: nobody of this run listens: {why_not}") from None
         try:
-            return _ask(visit, line)
+            return _ask(connection, line)
         except OSError as error:
             why = str(error.strerror or error)
             raise RunFailedError(f"{name}: it took no order: {why}") from None
@@ -108,13 +112,13 @@ def _line_of(order: Mapping[str, Any], name: str) -> bytes:
     return line
 
 
-def _ask(visit: socket.socket, line: bytes) -> Mapping[str, Any]:
+def _ask(connection: socket.socket, line: bytes) -> Mapping[str, Any]:
     deadline_s = monotonic() + ANSWER_S
-    visit.sendall(line)
+    connection.sendall(line)
     heard = b""
     while not heard.endswith(b"\n"):
-        visit.settimeout(max(0.001, deadline_s - monotonic()))
-        data = visit.recv(ANSWER_BYTES_MAX)
+        connection.settimeout(max(0.001, deadline_s - monotonic()))
+        data = connection.recv(ANSWER_BYTES_MAX)
         heard += data
         if not data or len(heard) > ANSWER_BYTES_MAX:
             raise ConnectionResetError("it closed the line; the run may be ending")

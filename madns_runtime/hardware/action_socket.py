@@ -1,7 +1,7 @@
 """
-Actions ordered while a run goes on, by the words of its timeline: `cosmos inject` knocks at the host's own door.
+Actions ordered while a run goes on, by the words of its timeline: `cosmos inject` connects to a socket of the host.
 
-A unix socket of this user alone in the run directory. What is ordered is checked here as a scenario is before a run.
+The socket lies in the run directory and is this user's alone. What is ordered is checked here as a scenario is before a run.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, Final, get_type_hints
 
 import orjson
 
+from madns_runtime.config import RunConfig
 from madns_runtime.declared_bounds import bound_faults
 from madns_runtime.errors import ConfigurationError, MadnsError
 from madns_runtime.hardware.fault_actions import check_fault
@@ -22,7 +23,7 @@ from madns_runtime.hardware.order_socket import LineSocket, Readers
 from madns_runtime.plain_values import from_mapping, is_real, shown, to_mapping
 from madns_runtime.timeline.action import ActionKind
 from madns_runtime.timeline.kinds import DEVICE_FAULT, DeviceFault
-from madns_runtime.timeline.runner import OrderedAction
+from madns_runtime.timeline.runner import OrderedAction, TimelineRunner
 
 SOCKET_NAME: Final = ".actions.sock"
 IN_FORCE_TOLD_MAX: Final = 100
@@ -36,9 +37,49 @@ Begin = Callable[[OrderedAction], str]
 """Begins an action and returns why it is refused, "" if it takes place."""
 
 
+def open_action_socket(  # noqa: PLR0913 - both time modes give what is theirs, all but two keyword-only
+    folder: Path,
+    loop: Readers,
+    *,
+    config: RunConfig,
+    kinds: Mapping[str, ActionKind],
+    runner: TimelineRunner,
+    begin: Begin,
+    say: Callable[[str, str], None],
+    is_immediate: bool = True,
+) -> ActionSocket | None:
+    """
+    Return the socket through which actions of a run are ordered; None, and a warning, where it cannot be made.
+
+    Args:
+        folder: The run directory.
+        loop: Of the host.
+        config: The run's.
+        kinds: Actions that this run carries out, by word.
+        runner: Knows what is in force.
+        begin: Called with what is ordered.
+        say: Takes the level and the text of the warning.
+        is_immediate: As of `ActionSocket`.
+    """
+    try:
+        return ActionSocket(
+            folder,
+            loop,
+            kinds=kinds,
+            agents=config.agents.resolved_names(),
+            devices=config.hardware.names,
+            begin=begin,
+            in_force=runner.told_in_force,
+            is_immediate=is_immediate,
+        )
+    except OSError as error:
+        say("warning", f"no action can be ordered in this run: {error}")
+        return None
+
+
 class ActionSocket:
     """
-    The door of one run.
+    The socket of one run.
 
     Args:
         folder: The run directory.
@@ -73,20 +114,20 @@ class ActionSocket:
         self._in_force = in_force
         self._is_immediate = is_immediate
         self._waiting: list[tuple[int, OrderedAction]] = []
-        self._door = LineSocket(folder, SOCKET_NAME, loop=loop, on_line=self._heard)
+        self._socket = LineSocket(folder, SOCKET_NAME, loop=loop, on_line=self._heard)
 
     def carry_out(self) -> None:
         """Carry out what was ordered since the last call."""
         waiting, self._waiting = self._waiting, []
         for number, order in waiting:
-            self._door.tell(number, {"refusal": self._begin(order)})
+            self._socket.tell(number, {"refusal": self._begin(order)})
 
     def close(self) -> None:
         """Refuse what waits, and take no more orders."""
         for number, _ in self._waiting:
-            self._door.tell(number, {"refusal": "the run is over"})
+            self._socket.tell(number, {"refusal": "the run is over"})
         self._waiting.clear()
-        self._door.close()
+        self._socket.close()
 
     def _heard(self, number: int, line: bytes) -> None:
         try:
@@ -94,11 +135,11 @@ class ActionSocket:
             if not isinstance(order, dict):
                 raise ConfigurationError("no order")
             if order.get("list"):
-                self._door.tell(number, self._listed())
+                self._socket.tell(number, self._listed())
                 return
             self._waiting.append((number, self._parsed(order)))
         except (ValueError, TypeError, MadnsError) as error:
-            self._door.tell(number, {"refusal": str(error)})
+            self._socket.tell(number, {"refusal": str(error)})
             return
         if self._is_immediate:
             self.carry_out()

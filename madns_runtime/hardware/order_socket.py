@@ -1,7 +1,7 @@
 """
-Door of a living run: commands of the same user hand whoever supervises it orders, one line each, and hear one line back.
+Sockets of a living run: a command of the same user connects, gives an order in one line, and gets one line back.
 
-A unix socket of this user alone in the run directory.
+Unix sockets of this user alone, in the run directory.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from madns_runtime.plain_values import is_real
 SOCKET_NAME: Final = ".orders.sock"
 LINE_BYTES_MAX: Final = 65_536
 """Of an order: the longest text that an action takes fits in several times."""
-VISITORS_MAX: Final = 8
-"""Each visitor beyond them closes the door behind the one that has waited longest."""
+CLIENTS_MAX: Final = 8
+"""With one more, the connection of the client that has waited longest is closed."""
 
 Fault = tuple[str, str, float | None]
 """Target, action and value."""
@@ -42,13 +42,13 @@ class Readers(Protocol):
 
 class LineSocket:
     """
-    A socket whose visitors each say one line, and hear one.
+    A socket whose clients each send one line, and get one.
 
     Args:
         folder: The run directory.
         name: Of the socket there.
         loop: Of the process.
-        on_line: Called with a visitor's number and its line; `tell` answers.
+        on_line: Called with a client's number and its line; `tell` answers.
 
     Raises:
         OSError: It cannot be made there.
@@ -60,67 +60,67 @@ class LineSocket:
         self._path = folder / name
         self._loop = loop
         self._on_line = on_line
-        self._visitors: dict[int, socket.socket] = {}
+        self._clients: dict[int, socket.socket] = {}
         self._heard: dict[int, bytes] = {}
         self._hearing: set[int] = set()
         self._count = 0
-        self._listener = private_socket.listen(folder, name, VISITORS_MAX)
+        self._listener = private_socket.listen(folder, name, CLIENTS_MAX)
         loop.add_reader(self._listener.fileno(), self._accept)
 
     def tell(self, number: int, reply: Mapping[str, Any]) -> None:
-        """Answer a visitor, and let it go."""
-        visitor = self._visitors.get(number)
-        if visitor is not None:
+        """Answer a client, and close its connection."""
+        client = self._clients.get(number)
+        if client is not None:
             with contextlib.suppress(OSError):  # it has gone, or takes nothing
-                visitor.send(orjson.dumps(reply) + b"\n")
-            self._dismiss(number)
+                client.send(orjson.dumps(reply) + b"\n")
+            self._disconnect(number)
 
     def close(self) -> None:
-        """Close the door, and all who stand in it."""
-        for number in list(self._visitors):
-            self._dismiss(number)
+        """Close the socket, and the connections of all clients."""
+        for number in list(self._clients):
+            self._disconnect(number)
         self._loop.remove_reader(self._listener.fileno())
         self._listener.close()
         with contextlib.suppress(OSError):
             self._path.unlink()
 
     def _accept(self) -> None:
-        visitor = private_socket.accept(self._listener)
-        if visitor is None:
+        client = private_socket.accept(self._listener)
+        if client is None:
             return
-        if len(self._visitors) >= VISITORS_MAX:
-            self._dismiss(min(self._visitors))
+        if len(self._clients) >= CLIENTS_MAX:
+            self._disconnect(min(self._clients))
         self._count += 1
         number = self._count
-        self._visitors[number], self._heard[number] = visitor, b""
+        self._clients[number], self._heard[number] = client, b""
         self._hearing.add(number)
-        self._loop.add_reader(visitor.fileno(), partial(self._hear, number))
+        self._loop.add_reader(client.fileno(), partial(self._hear, number))
 
     def _hear(self, number: int) -> None:
         try:
-            data = self._visitors[number].recv(LINE_BYTES_MAX)
+            data = self._clients[number].recv(LINE_BYTES_MAX)
         except BlockingIOError:
             return
         except OSError:
             data = b""
         heard = self._heard[number] = self._heard[number] + data
         if not data:
-            self._dismiss(number)
+            self._disconnect(number)
         elif len(heard) > LINE_BYTES_MAX:
             self.tell(number, {"refusal": overlong(len(heard))})
         elif heard.endswith(b"\n"):
             self._stop_hearing(number)
             self._on_line(number, heard)
 
-    def _dismiss(self, number: int) -> None:
+    def _disconnect(self, number: int) -> None:
         self._stop_hearing(number)
         del self._heard[number]
-        self._visitors.pop(number).close()
+        self._clients.pop(number).close()
 
     def _stop_hearing(self, number: int) -> None:
         if number in self._hearing:
             self._hearing.remove(number)
-            self._loop.remove_reader(self._visitors[number].fileno())
+            self._loop.remove_reader(self._clients[number].fileno())
 
 
 def overlong(size_bytes: int) -> str:
@@ -132,7 +132,7 @@ def overlong(size_bytes: int) -> str:
 
 class OrderSocket(LineSocket):
     """
-    The side of who supervises the run: the operator, or the host of a run that goes on without one.
+    The socket for faults of devices. Whoever supervises the run has it: the operator, or the host of a detached run.
 
     Args:
         folder: The run directory.
@@ -148,7 +148,7 @@ class OrderSocket(LineSocket):
         super().__init__(folder, SOCKET_NAME, loop=loop, on_line=self._obey)
 
     def answer(self, number: int, refusal: str) -> None:
-        """Tell who gave an order what became of it, and let them go."""
+        """Tell who gave an order what became of it, and close the connection."""
         self.tell(number, {"refusal": refusal})
 
     def _obey(self, number: int, line: bytes) -> None:

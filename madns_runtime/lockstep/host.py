@@ -204,7 +204,7 @@ class LockstepHost:
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         self._account.t0_utc = utc_now_iso()
         self._account.began_s = monotonic()
-        self._timeline.open_door(self._directory.parent, self._meeting.reactor, self._log)
+        self._timeline.accept_orders(self._directory.parent, self._meeting.reactor, self._log)
         self._guarded.call("start", self._clock.t_s)
         self._half.begin_timer(self._clock.t_s)
         self._guarded.call_timer(self._clock.t_s)

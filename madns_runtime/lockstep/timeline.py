@@ -8,7 +8,7 @@ from pathlib import Path
 
 from madns_runtime.conditions.reports import HostConditions, MetCondition
 from madns_runtime.errors import MadnsError
-from madns_runtime.hardware.action_socket import ActionSocket
+from madns_runtime.hardware.action_socket import ActionSocket, open_action_socket
 from madns_runtime.hardware.order_socket import Readers
 from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.plugin.action_handlers import timeline_runner
@@ -45,39 +45,36 @@ class LockstepTimeline:
             stop=self._stop,
             intended=core.account.intended,
         )
-        self._door: ActionSocket | None = None
+        self._action_socket: ActionSocket | None = None
 
     def wait_for(self, conditions: HostConditions) -> None:
         """Have the actions begin that wait for conditions."""
         for number in {e.condition for e in self._config.timeline if e.condition is not None}:
             conditions.on_met(number, self._met)
 
-    def open_door(self, folder: Path, loop: Readers, say: Callable[[str, str], None]) -> None:
+    def accept_orders(self, folder: Path, loop: Readers, say: Callable[[str, str], None]) -> None:
         """Take orders of actions in the run directory from now on; they are carried out before the next tick."""
-        try:
-            self._door = ActionSocket(
-                folder,
-                loop,
-                kinds=self.kinds,
-                agents=self._config.agents.resolved_names(),
-                devices=self._config.hardware.names,
-                begin=lambda order: self.runner.order(order, self._clock.t_s),
-                in_force=self.runner.told_in_force,
-                is_immediate=False,
-            )
-        except OSError as error:
-            say("warning", f"no action can be ordered in this run: {error}")
+        self._action_socket = open_action_socket(
+            folder,
+            loop,
+            config=self._config,
+            kinds=self.kinds,
+            runner=self.runner,
+            begin=lambda order: self.runner.order(order, self._clock.t_s),
+            say=say,
+            is_immediate=False,
+        )
 
     def take_orders(self) -> None:
         """Carry out what was ordered."""
-        if self._door is not None:
-            self._door.carry_out()
+        if self._action_socket is not None:
+            self._action_socket.carry_out()
 
     def close(self) -> None:
         """Take no more orders."""
-        if self._door is not None:
-            self._door.close()
-            self._door = None
+        if self._action_socket is not None:
+            self._action_socket.close()
+            self._action_socket = None
 
     def next_s(self, half_s: float | None) -> tuple[float | None, bool]:
         """Return the time of what comes next, given when the half wants to be called, and whether it is an action."""
@@ -98,9 +95,8 @@ class LockstepTimeline:
         self.runner.close()
 
     def _post(self, agent: str, order: ActionOrder) -> bool:
-        if (
-            order.word == DEVICE_FAULT.word
-        ):  # of the present, at its end as well: between two ticks it cuts samples
+        if order.word == DEVICE_FAULT.word:
+            # Of the present, at its end as well: between two ticks it cuts samples.
             order = dataclasses.replace(order, t_s=self._clock.t_s)
         try:
             return self._outbox.post(agent, order)

@@ -147,20 +147,20 @@ class OperatorLink:
         self._is_last_call = False
         self._cut_until_s = math.inf
         self._cut_timer = reactor.call_at(math.inf, self._given_up)
-        self._door: AttachSocket | None = None
+        self._attach_socket: AttachSocket | None = None
         self._silence_timer = reactor.call_at(math.inf, self._fallen_silent)
         os.set_blocking(self._read_fd, False)
         os.set_blocking(self._write_fd, False)
         reactor.add_reader(self._read_fd, self._readable)
         if way_back is not None:
-            self._door = self._open_door(way_back)
+            self._attach_socket = self._open_attach_socket(way_back)
         if pending:
             # In the loop, not here: whoever makes this link is not yet ready for commands.
             reactor.call_at(reactor.now_s(), lambda: self._take(pending))
 
     def emit(self, event: Mapping[str, Any]) -> None:
         """Send one event; never blocks."""
-        if self._door is not None:
+        if self._attach_socket is not None:
             line = self._kept.add(event)
             if self.is_cut:
                 return
@@ -176,7 +176,7 @@ class OperatorLink:
 
     def _send(self, line: bytes) -> None:
         if self._is_deaf:
-            self._dropped_count += self._door is None
+            self._dropped_count += self._attach_socket is None
             return
         self._out.append(line)
         self._out_bytes += len(line)
@@ -220,8 +220,8 @@ class OperatorLink:
         One that may come back has told of the last event when this is done; if its line ends meanwhile, it has
         its time to come back, and then *timeout_s* anew.
         """
-        if self._door is not None:
-            return self._flush_and_hear(self._door, timeout_s)
+        if self._attach_socket is not None:
+            return self._flush_and_hear(self._attach_socket, timeout_s)
         deadline_s = monotonic() + timeout_s
         while self._out and not self.is_gone:
             left_s = deadline_s - monotonic()
@@ -234,9 +234,9 @@ class OperatorLink:
         """Stop listening; the descriptors stay open."""
         self._silence_timer.cancel()
         self._cut_timer.cancel()
-        if self._door is not None:
-            self._door.close()
-            self._door = None
+        if self._attach_socket is not None:
+            self._attach_socket.close()
+            self._attach_socket = None
         if not self.is_gone:
             self._reactor.remove_reader(self._read_fd)
 
@@ -249,7 +249,7 @@ class OperatorLink:
                 return
             except OSError:
                 self._is_deaf = True
-                self._dropped_count += len(self._out) if self._door is None else 0
+                self._dropped_count += len(self._out) if self._attach_socket is None else 0
                 self._out.clear()
                 self._out_bytes = 0
                 return
@@ -268,7 +268,7 @@ class OperatorLink:
             data = b""
         if data:
             self._take(data)
-        elif self._way_back is None or self._door is None:
+        elif self._way_back is None or self._attach_socket is None:
             self._lost()
         else:
             self._cut(self._way_back.wait_s)
@@ -292,7 +292,7 @@ class OperatorLink:
 
     # The way back ---------------------------------------------------------------------------------
 
-    def _open_door(self, way_back: Reattachment) -> AttachSocket | None:
+    def _open_attach_socket(self, way_back: Reattachment) -> AttachSocket | None:
         try:
             return AttachSocket(self._reactor, way_back, self._attached)
         except OSError as error:
@@ -311,11 +311,11 @@ class OperatorLink:
         self._cut_timer.reschedule(self._cut_until_s)
 
     def _given_up(self) -> None:
-        """Take an operator for gone that has not come back; one that knocked while the loop was busy is heard."""
-        assert self._door is not None
-        if ready([self._door.fileno()], [], 0)[0]:
-            self._door.step()
-        if self.is_cut and self._door.is_visited and not self._is_last_call:
+        """Take an operator for gone that has not come back; one that connected while the loop was busy is heard."""
+        assert self._attach_socket is not None
+        if ready([self._attach_socket.fileno()], [], 0)[0]:
+            self._attach_socket.step()
+        if self.is_cut and self._attach_socket.has_client and not self._is_last_call:
             self._is_last_call = True
             self._cut_timer.reschedule(self._reactor.now_s() + ATTACH_LINE_S)
         elif self.is_cut:
@@ -343,20 +343,20 @@ class OperatorLink:
         self._on_attached()
         self._take(rest)
 
-    def _flush_and_hear(self, door: AttachSocket, timeout_s: float) -> bool:
+    def _flush_and_hear(self, attach_socket: AttachSocket, timeout_s: float) -> bool:
         deadline_s = monotonic() + timeout_s
         while self._kept and not self.is_gone:
             left_s = (self._cut_until_s if self.is_cut else deadline_s) - monotonic()
             if left_s <= 0:
                 return False
-            reading = [door.fileno(), *(() if self.is_cut else (self._read_fd,))]
+            reading = [attach_socket.fileno(), *(() if self.is_cut else (self._read_fd,))]
             writing = [self._write_fd] if self._out and not self.is_cut else []
             readable, writable = ready(reading, writing, left_s)
             was_cut = self.is_cut
             if writable:
                 self._write()
-            if door.fileno() in readable:
-                door.step()
+            if attach_socket.fileno() in readable:
+                attach_socket.step()
             elif readable:
                 self._readable()
             if was_cut and not self.is_cut:

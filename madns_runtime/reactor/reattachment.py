@@ -92,7 +92,7 @@ class KeptEvents:
 
 class AttachSocket:
     """
-    The socket at which an operator comes back; one visitor at a time says what it wants.
+    The socket at which an operator comes back; one client at a time introduces itself.
 
     Args:
         reactor: The loop.
@@ -114,7 +114,7 @@ class AttachSocket:
         self._place = place
         self._name = OPERATOR_SOCKET.format(place.incarnation)
         self._on_attached = on_attached
-        self._visitor: socket.socket | None = None
+        self._client: socket.socket | None = None
         self._line = b""
         self._timer = reactor.call_at(float("inf"), self._overdue)
         self._listener = private_socket.listen(place.directory, self._name, BACKLOG)
@@ -122,22 +122,22 @@ class AttachSocket:
 
     def fileno(self) -> int:
         """Return what is readable when `step` has something to do."""
-        return (self._visitor or self._listener).fileno()
+        return (self._client or self._listener).fileno()
 
     @property
-    def is_visited(self) -> bool:
-        """Whether a connection has not said yet what it wants."""
-        return self._visitor is not None
+    def has_client(self) -> bool:
+        """Whether a client is connected that has not introduced itself yet."""
+        return self._client is not None
 
     def step(self) -> None:
         """Do what is due, outside of the loop."""
-        if self._visitor is None:
+        if self._client is None:
             self._accept()
         else:
             self._read()
 
     def close(self) -> None:
-        """Let nobody in any more."""
+        """Accept no more clients."""
         self._refuse()
         self._reactor.remove_reader(self._listener.fileno())
         self._listener.close()
@@ -145,18 +145,18 @@ class AttachSocket:
             (self._place.directory / self._name).unlink()
 
     def _accept(self) -> None:
-        visitor = private_socket.accept(self._listener)
-        if visitor is None:
+        client = private_socket.accept(self._listener)
+        if client is None:
             return
-        self._visitor, self._line = visitor, b""
+        self._client, self._line = client, b""
         self._reactor.remove_reader(self._listener.fileno())  # the next one waits
-        self._reactor.add_reader(visitor.fileno(), self._read)
+        self._reactor.add_reader(client.fileno(), self._read)
         self._timer.reschedule(self._reactor.now_s() + ATTACH_LINE_S)
 
     def _read(self) -> None:
-        assert self._visitor is not None
+        assert self._client is not None
         try:
-            data = self._visitor.recv(ATTACH_LINE_BYTES_MAX)
+            data = self._client.recv(ATTACH_LINE_BYTES_MAX)
         except BlockingIOError:
             return
         except OSError:
@@ -164,12 +164,12 @@ class AttachSocket:
         self._line += data
         line, end, rest = self._line.partition(b"\n")
         if end and (seen := self._seen(line)) is not None:
-            self._on_attached(self._leave_visitor(), seen, rest)
+            self._on_attached(self._take_client(), seen, rest)
         elif end or not data or len(line) > ATTACH_LINE_BYTES_MAX:
             self._refuse()
 
     def _seen(self, line: bytes) -> int | None:
-        """Return the last event that the operator saw; None for a visitor that does not belong here."""
+        """Return the last event that the operator saw; None for a client that does not belong here."""
         try:
             asked = orjson.loads(line)
             mine = ("attach", self._place.session_hex, self._place.incarnation)
@@ -178,21 +178,21 @@ class AttachSocket:
         except (orjson.JSONDecodeError, KeyError, TypeError, ValueError):
             return None
 
-    def _leave_visitor(self) -> socket.socket:
-        visitor = self._visitor
-        assert visitor is not None
-        self._visitor = None
+    def _take_client(self) -> socket.socket:
+        client = self._client
+        assert client is not None
+        self._client = None
         self._timer.reschedule(float("inf"))
-        self._reactor.remove_reader(visitor.fileno())
+        self._reactor.remove_reader(client.fileno())
         self._reactor.add_reader(self._listener.fileno(), self._accept)
-        return visitor
+        return client
 
     def _overdue(self) -> None:
-        """Turn away a visitor that says nothing; one whose line came while the loop was busy is heard."""
-        if self._visitor is not None:
+        """Turn away a client that sends nothing; one whose line came while the loop was busy is read."""
+        if self._client is not None:
             self._read()
         self._refuse()
 
     def _refuse(self) -> None:
-        if self._visitor is not None:
-            self._leave_visitor().close()
+        if self._client is not None:
+            self._take_client().close()

@@ -10,7 +10,7 @@ from typing import Final
 
 from madns_runtime.conditions.reports import HostConditions, MetCondition
 from madns_runtime.errors import MadnsError
-from madns_runtime.hardware.action_socket import ActionSocket
+from madns_runtime.hardware.action_socket import ActionSocket, open_action_socket
 from madns_runtime.plugin.action_handlers import AgentOrders, timeline_runner
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.protocol.messages import ActionOrder, Service
@@ -52,7 +52,7 @@ class HostTimeline:
         self._pump = core.pump
         self._reactor = core.reactor
         self.faults = HostFaults(core)
-        self._door: ActionSocket | None = None
+        self._action_socket: ActionSocket | None = None
         self._end_s: float | None = None
         """Simulated time at which a stop ends the run, s; None without one."""
         self._early: list[MetCondition] = []
@@ -79,18 +79,15 @@ class HostTimeline:
     def begin(self, folder: Path, say: Callable[[str, str], None]) -> None:
         """Simulated time zero is set: wait for what is due, and for orders in the run directory."""
         self._arm()
-        try:
-            self._door = ActionSocket(
-                folder,
-                self._reactor,
-                kinds=self.kinds,
-                agents=self._config.agents.resolved_names(),
-                devices=self._config.hardware.names,
-                begin=self._order,
-                in_force=self.runner.told_in_force,
-            )
-        except OSError as error:
-            say("warning", f"no action can be ordered in this run: {error}")
+        self._action_socket = open_action_socket(
+            folder,
+            self._reactor,
+            config=self._config,
+            kinds=self.kinds,
+            runner=self.runner,
+            begin=self._order,
+            say=say,
+        )
 
     def resume(self, agent: str) -> None:
         """Let what is in force go on at an agent that has returned: a stop that it has not heard of, too."""
@@ -100,9 +97,9 @@ class HostTimeline:
 
     def close(self) -> None:
         """Take no more orders."""
-        if self._door is not None:
-            self._door.close()
-            self._door = None
+        if self._action_socket is not None:
+            self._action_socket.close()
+            self._action_socket = None
 
     def _order(self, order: OrderedAction) -> str:
         if not self._port.is_in(HostState.SIMULATION_START) or self._port.now_s() < 0.0:

@@ -50,13 +50,13 @@ class UnwatchedDevices:
         self._users = {each.full_name: each.users for each in launch.devices}
         self._told: set[tuple[str, str]] = set()
         self._orders: dict[int, _Order] = {}
-        self._door: OrderSocket | None = None
+        self._socket: OrderSocket | None = None
         self._reactor = reactor
         self._timer = reactor.call_at(math.inf, self._look_again)
         if not launch.is_detached or not launch.devices:
             return
         try:
-            self._door = OrderSocket(Path(launch.directory).parent, reactor, self._ordered)
+            self._socket = OrderSocket(Path(launch.directory).parent, reactor, self._ordered)
         except OSError as error:
             core.journal.say("warning", f"no fault can be inserted in this run: {error}")
 
@@ -76,9 +76,9 @@ class UnwatchedDevices:
         """Take no more orders."""
         for number in list(self._orders):
             self._answer(number, "the run is over")
-        if self._door is not None:
-            self._door.close()
-            self._door = None
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
     def _lost(self, device: str, why: str) -> None:
         if (device, why) in self._told:
@@ -126,5 +126,5 @@ class UnwatchedDevices:
     def _answer(self, number: int, refusal: str) -> None:
         device, action, value = self._orders.pop(number).fault
         self._journal.event("fault", target=device, action=action, value=value, refusal=refusal)
-        if self._door is not None:
-            self._door.answer(number, refusal)
+        if self._socket is not None:
+            self._socket.answer(number, refusal)

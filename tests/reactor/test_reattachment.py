@@ -274,11 +274,11 @@ def test_visitor_whose_line_came_while_the_loop_was_busy_is_let_in(make, monkeyp
     stage = make()
     stage.break_line()
     visitor = stage.knock()
-    stage.run_until(lambda: stage.link._door.is_visited)
+    stage.run_until(lambda: stage.link._attach_socket.has_client)
     stage.introduce(visitor)
     threading.Event().wait(0.4)  # the plug-in's call
 
-    stage.run_until(lambda: stage.attached or not stage.link._door.is_visited)
+    stage.run_until(lambda: stage.attached or not stage.link._attach_socket.has_client)
 
     assert stage.attached
 

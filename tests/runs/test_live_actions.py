@@ -39,7 +39,11 @@ def test_orders_are_taken_listed_refused_and_recorded_and_a_stop_completes_the_r
         return done.returncode, json.loads(done.stdout) if done.stdout else done.stderr
 
     with cosmos.start_run(path) as run:
-        wait_until(lambda: list(cosmos.runs.glob("*/.actions.sock")), "the run's door", process=run)
+        wait_until(
+            lambda: list(cosmos.runs.glob("*/.actions.sock")),
+            "the run's socket for actions",
+            process=run,
+        )
         assert inject("run", "annotate", "text=hello", "for_s=1e7")[0] == 0
         assert inject("run", "annotate", "text=5", "for_s=1e7")[0] == 0
         code, listed = inject("--list")

@@ -131,7 +131,7 @@ def test_it_goes_on_without_its_operator_takes_orders_and_ends_by_down(cosmos, m
     endless = ("--set", "time.duration_s=300000", "--detach")
     left = cosmos("run", SCENARIOS / "counter24.yaml", *LOCKSTEP, *endless)
     shown = cosmos("ps").stdout
-    wait_until(lambda: list(cosmos.runs.glob("*/.actions.sock")), "the run's door")
+    wait_until(lambda: list(cosmos.runs.glob("*/.actions.sock")), "the run's socket for actions")
     ordered = cosmos("inject", "last", "agent-01", "hang", "--json")
     in_force = json.loads(cosmos("inject", "last", "--list", "--json").stdout)["in_force"]
     down = cosmos("down", "--all")
