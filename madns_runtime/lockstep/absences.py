@@ -41,8 +41,8 @@ class Absences:
         self._duration_s = config.time.duration_s
         self._goes_on = config.on_agent_loss == "continue"
         self._account = core.account
-        self._crew = core.crew
-        self._meeting = core.meeting
+        self._pool = core.pool
+        self._barrier = core.barrier
         self._outbox = core.outbox
         self._half = core.half
         self._journal = core.journal
@@ -57,7 +57,7 @@ class Absences:
 
     def begin(self) -> None:
         """Go on without who is lost from now on, if the run is to."""
-        self._meeting.goes_on = self._goes_on
+        self._barrier.goes_on = self._goes_on
 
     # Losses ---------------------------------------------------------------------------------------
 
@@ -99,10 +99,10 @@ class Absences:
         """End a run of which no agent is left, nor returns before it is over."""
         agents = self._account.agents
         is_waiting = any(due_s < self._duration_s for due_s, _ in self._returns)
-        if all(agent.is_lost for agent in agents) and not (is_waiting and self._crew.are_living):
+        if all(agent.is_lost for agent in agents) and not (is_waiting and self._pool.are_living):
             names = self._account.names
             reasons = dict.fromkeys(agent.reason or "" for agent in agents)
-            self._meeting.fail(", ".join(names), "; ".join(reasons))
+            self._barrier.fail(", ".join(names), "; ".join(reasons))
 
     # Returns --------------------------------------------------------------------------------------
 
@@ -122,26 +122,26 @@ class Absences:
         while returns and returns[0][0] <= t_s + TIME_EPSILON_S:
             due.append(heapq.heappop(returns)[1])
         returning = [index for index in sorted(set(due)) if self._account.agents[index].is_lost]
-        if returning and self._crew.are_living:
+        if returning and self._pool.are_living:
             self._start_anew(number, returning, settle)
 
     def _start_anew(self, number: int, returning: list[int], settle: Callable[[], None]) -> None:
         account, orders = self._account, dict[int, list[tuple[int, int, bytes]]]()
         for index in returning:
-            worker = self._crew.worker_for(index)
+            worker = self._pool.worker_for(index)
             assert worker is not None, "one lives"
-            place = self._crew.number_of(worker)
+            place = self._pool.number_of(worker)
             self._outbox.move(index, place)
             incarnation = account.take_back(
                 index
             )  # it is there again: what is sent with its data arrives
             data = pack(self._half.call("initial_data", account.names[index]))
             orders.setdefault(place, []).append((index, incarnation, data))
-        self._meeting.forget_answers()
+        self._barrier.forget_answers()
         for place in sorted(orders):
-            worker = self._crew.workers[place]
-            self._meeting.order(worker, frames.RETURN, number, orders[place])
-        self._meeting.await_told("has not set up the agents that return")
+            worker = self._pool.workers[place]
+            self._barrier.order(worker, frames.RETURN, number, orders[place])
+        self._barrier.await_told("has not set up the agents that return")
         settle()
         for index in returning:
             if not account.agents[index].is_lost:
@@ -165,11 +165,11 @@ class Absences:
         """
         wanted = set(agents)
         indices = [i for i, name in enumerate(self._account.names) if name in wanted]
-        self._meeting.forget_answers()
-        for worker in self._crew.workers:
+        self._barrier.forget_answers()
+        for worker in self._pool.workers:
             # Those without any of the agents, too: what an agent records bears one time, whoever shares its process.
             own = [index for index in indices if index in worker.agents]
             told = dataclasses.astuple(fault)
-            self._meeting.order(worker, frames.FAULT, self._clock.t_s, told, own)
-        self._meeting.await_told("has not begun a fault")
+            self._barrier.order(worker, frames.FAULT, self._clock.t_s, told, own)
+        self._barrier.await_told("has not begun a fault")
         self.heed()

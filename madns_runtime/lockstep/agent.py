@@ -37,7 +37,7 @@ from madns_runtime.timeline.kinds import DEVICE_FAULT, DeviceFault
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Crewmates:
+class WorkerCore:
     """State that the agents of one worker share."""
 
     config: RunConfig
@@ -57,7 +57,7 @@ class LockstepAgent:
 
     Args:
         index: Its number among the run's agents, from 0.
-        mates: What it shares with the others of its process.
+        core: What it shares with the others of its process.
         incarnation: Which incarnation of the agent this is.
         devices: Those of the incarnation before, if its worker has them.
 
@@ -69,34 +69,34 @@ class LockstepAgent:
     def __init__(
         self,
         index: int,
-        mates: Crewmates,
+        core: WorkerCore,
         *,
         incarnation: int = 1,
         devices: AgentDevices | None = None,
     ) -> None:
         self.index = index
-        self.name = mates.config.agents.resolved_names()[index]
-        self._clock = mates.clock
-        self._outbox = mates.outbox
+        self.name = core.config.agents.resolved_names()[index]
+        self._clock = core.clock
+        self._outbox = core.outbox
         self.conditions = ConditionTap(
             self.name,
-            mates.config.conditions,
-            tick_hz=mates.config.agents.tick_hz,
-            now_s=mates.clock.now_s,
+            core.config.conditions,
+            tick_hz=core.config.agents.tick_hz,
+            now_s=core.clock.now_s,
             report=self._condition_met,
         )
         self.look = self.conditions.look if self.conditions.must_look else None
         """Called after each step with its simulated time, s; None if no condition has to hold for a while."""
         self.journal = open_journal(
-            mates.directory / "agents" / self.name,
-            mates.config,
+            core.directory / "agents" / self.name,
+            core.config,
             source=self.name,
-            clock=mates.clock,
+            clock=core.clock,
             tap=self.conditions,
             incarnation=incarnation,
         )
-        self.columns = NewestValues(self.journal.recorder, mates.program.columns)
-        self._mates = mates
+        self.columns = NewestValues(self.journal.recorder, core.program.columns)
+        self._core = core
         self.is_made = False
         """Whether its half is made."""
         self.stepping = index * POSITIONS + STEPPING
@@ -105,24 +105,24 @@ class LockstepAgent:
         self._allowance = Allowance()
         self.mailbox = Mailbox(
             self.name,
-            mates.config.agents.resolved_names(),
-            has_medium=mates.program.has_medium,
+            core.config.agents.resolved_names(),
+            has_medium=core.program.has_medium,
             post=self._transmit,
             incarnation=incarnation,
         )
         self.devices = devices or AgentDevices(
-            [each for each in mates.devices if self.name in each.users],
-            mates.config,
-            directory=mates.directory,
-            clock=mates.clock,
+            [each for each in core.devices if self.name in each.users],
+            core.config,
+            directory=core.directory,
+            clock=core.clock,
         )
         self.has_devices = bool(self.devices)
         self.context = PeerContext(
             name=self.name,
-            config=mates.config,
-            parameters=mates.program.parameters_of(self.name),
+            config=core.config,
+            parameters=core.program.parameters_of(self.name),
             journal=self.journal,
-            now_s=mates.clock.now_s,
+            now_s=core.clock.now_s,
             send=self.send,
             mailbox=self.mailbox,
             hardware=self.devices.hardware,
@@ -131,7 +131,7 @@ class LockstepAgent:
             self._make_half()
 
     def _make_half(self) -> None:
-        program = self._mates.program
+        program = self._core.program
         self.half = Half(program.make, self.journal.say)
         self.step = self.half.simulation.step
         self.actions = AgentActions(

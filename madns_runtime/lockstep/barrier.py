@@ -1,7 +1,7 @@
 """
-The wait of a lockstep run's host for its workers; the operator is heard meanwhile.
+The barrier of a lockstep run: its host waits there for its workers, and hears the operator meanwhile.
 
-Whatever ends a run before its time, wherever it is noticed, is noted as its ending; whoever waits
+What ends a run before its time is noted here as its ending, wherever it was noticed; whatever waits
 then raises RunEnds.
 """
 
@@ -18,7 +18,7 @@ from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import encode_frame
 from madns_runtime.lockstep.result import LOST, EarlyEnd, RunAccount
-from madns_runtime.lockstep.workers import WorkerProcess, Workers
+from madns_runtime.lockstep.workers import WorkerPool, WorkerProcess
 from madns_runtime.reactor.operator_link import OPERATOR_GONE, OperatorLink
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.timing.granted_clock import GrantedLimit, is_stopped
@@ -28,21 +28,21 @@ PROGRESS_INTERVAL_S = 0.5
 SERVE_INTERVAL_S = 0.2
 """A host that is busy with its own half hears the operator this often."""
 SERVE_WAIT_S = 0.001
-"""So long; a timer that is due at once would stop the loop before it has looked."""
+"""Length of such a hearing: a timer that is due at once would stop the loop before it has looked."""
 STACK_HINT = "host/stderr.txt shows where it hung"
 
 
 class RunEnds(Exception):
-    """The run cannot go on; why is noted."""
+    """The run cannot go on; the barrier's `ending` says why."""
 
 
-class Meeting:
+class Barrier:
     """
     The workers, the operator, and the loop in which both are heard.
 
     Args:
         launch: The run.
-        crew: The workers.
+        pool: The workers.
         account: Where what they say is noted.
         clock: Simulated time.
         fds: Where the operator's commands come from and events go to.
@@ -52,7 +52,7 @@ class Meeting:
     def __init__(  # noqa: PLR0913 - the collaborators of a seam, most keyword-only
         self,
         launch: HostLaunch,
-        crew: Workers,
+        pool: WorkerPool,
         *,
         account: RunAccount,
         clock: SimulatedClock,
@@ -60,7 +60,7 @@ class Meeting:
         pending: bytes,
     ) -> None:
         self._timeouts = launch.config.timeouts
-        self._crew = crew
+        self._pool = pool
         self._account = account
         self._clock = clock
         self.reactor = Reactor()
@@ -72,7 +72,7 @@ class Meeting:
             pending=pending,
             is_detached=launch.is_detached,
         )
-        crew.listen(self.reactor, on_frame=self._said, on_lost=self._worker_lost)
+        pool.listen(self.reactor, on_frame=self._said, on_lost=self._worker_lost)
         self.goes_on = False
         """Whether the run goes on without an agent that is lost now."""
         self.is_open = True
@@ -114,7 +114,7 @@ class Meeting:
         Raises:
             RunEnds: One of them cannot, or something else ends the run.
         """
-        for worker, box in zip(self._crew.workers, boxes, strict=True):
+        for worker, box in zip(self._pool.workers, boxes, strict=True):
             self.order(worker, *order, box)
             box.clear()
         self.await_all(self._timeouts.tick_s)
@@ -130,7 +130,7 @@ class Meeting:
             return
         limit_s = self._timeouts.tick_s
         try:
-            self._crew.order(worker, encode_frame(*parts), limit_s)
+            self._pool.order(worker, encode_frame(*parts), limit_s)
         except TimeoutError:
             ending = self._blame(worker, limit_s, "does not read", "tick_s")
             if ending is not None:
@@ -147,8 +147,8 @@ class Meeting:
             RunEnds: One of them cannot, or something else ends the run.
         """
         blame = partial(self._blame, late=late, setting=setting)
-        self.wait(lambda: self._crew.awaited is None, limit_s, blame)
-        for answer in self._crew.answers():
+        self.wait(lambda: self._pool.awaited is None, limit_s, blame)
+        for answer in self._pool.answers():
             if answer[0] == frames.FAILED:
                 self.fail(self._account.names[answer[1]], answer[2])
             for loss in answer[frames.LOSSES] if len(answer) > frames.LOSSES else ():
@@ -156,7 +156,7 @@ class Meeting:
 
     def forget_answers(self) -> None:
         """Forget what the workers answered: those that are told nothing next have nothing to say."""
-        for worker in self._crew.workers:
+        for worker in self._pool.workers:
             worker.answer = None if worker.has_ended else [frames.DONE, (), ()]
 
     def await_told(self, late: str) -> None:
@@ -178,7 +178,7 @@ class Meeting:
         Raises:
             RunEnds: The time is over, or something else ends the run.
         """
-        self._late = (GrantedLimit(limit_s), lambda: late(self._crew.awaited, limit_s))
+        self._late = (GrantedLimit(limit_s), lambda: late(self._pool.awaited, limit_s))
         self._limit_s = limit_s
         while self.ending is None and not is_done():
             self.reactor.run()
@@ -205,7 +205,7 @@ class Meeting:
     def messages(self) -> Iterator[tuple[int, int, bytes]]:
         """Yield what the agents sent, in their order: whose it is, its class of service, its body."""
         sent = []
-        for answer in self._crew.answers():
+        for answer in self._pool.answers():
             self._account.note_values(answer[2])
             sent += answer[1]
         # A worker tells first what all its agents answered, then their steps; of one agent, as it sent them.
@@ -215,12 +215,12 @@ class Meeting:
         """Have all close their records and end; return the agents of which there is no word that they did."""
         self.is_open, self.ending = False, None
         limit_s = self._timeouts.shutdown_s
-        self._crew.stop(reason, limit_s)
+        self._pool.stop(reason, limit_s)
         # Each agent's word gives the next as long again.
         self._late = (GrantedLimit(limit_s), lambda: EarlyEnd(who="", reason=""))
-        while self._is_in_time() and not self._crew.have_all_ended:
+        while self._is_in_time() and not self._pool.have_all_ended:
             self.reactor.run()
-        self._crew.end_left()
+        self._pool.end_left()
         agents = zip(self._account.names, self._account.agents, strict=True)
         settled = ("stopped", LOST) if self.goes_on else ("stopped",)
         return tuple(name for name, account in agents if account.state not in settled)
@@ -246,7 +246,7 @@ class Meeting:
             worker.answer = (
                 frame  # a process that came back told its failure before the worker answered
             )
-        if self._crew.awaited is None:
+        if self._pool.awaited is None:
             self.reactor.stop()
 
     def _worker_lost(self, worker: WorkerProcess, how: str) -> None:
@@ -292,7 +292,7 @@ class Meeting:
         stopped = " (it is stopped)" if is_stopped(worker.pid) else ""
         told = f"{what} within {limit_s:g} s{self.when()}{stopped}"
         reason = f"{told}; {STACK_HINT} (limit: timeouts.{setting})"
-        self._crew.tell_stack(worker)
+        self._pool.tell_stack(worker)
         self._lose(worker, reason)
         if self.goes_on:
             return None

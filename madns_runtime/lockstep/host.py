@@ -18,7 +18,7 @@ from madns_runtime.conditions.reports import HostConditions
 from madns_runtime.config import HostLaunch
 from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.absences import Absences
-from madns_runtime.lockstep.barrier import Meeting, RunEnds
+from madns_runtime.lockstep.barrier import Barrier, RunEnds
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.lockstep.host_faults import LockstepFaults
@@ -28,7 +28,7 @@ from madns_runtime.lockstep.partition import processors_here, share_out
 from madns_runtime.lockstep.recorder import open_journal
 from madns_runtime.lockstep.result import EarlyEnd, RunAccount
 from madns_runtime.lockstep.timeline import LockstepTimeline
-from madns_runtime.lockstep.workers import Workers
+from madns_runtime.lockstep.workers import WorkerPool
 from madns_runtime.medium.carrier import Carrier
 from madns_runtime.plugin.api import HOST
 from madns_runtime.plugin.context import JobContext
@@ -73,7 +73,7 @@ class LockstepHost:
         allow_descriptors()
         shares = share_out(config.agents, processors_here())
         # Everything that forks comes before every thread; workers load their half at the same time.
-        self._crew = Workers(launch, self._directory.parent, shares)
+        self._pool = WorkerPool(launch, self._directory.parent, shares)
         self._program = program = RoleProgram.load(
             config, "host", tell=partial(tell_loading, fds[1])
         )
@@ -93,10 +93,10 @@ class LockstepHost:
             self._directory, config, source=HOST, clock=clock, tap=conditions.tap
         )
         self._outbox = Outbox(shares, account=account, clock=clock, journal=self._journal)
-        self._meeting = Meeting(
-            launch, self._crew, account=account, clock=clock, fds=fds, pending=pending
+        self._barrier = Barrier(
+            launch, self._pool, account=account, clock=clock, fds=fds, pending=pending
         )
-        self._operator = self._meeting.operator
+        self._operator = self._barrier.operator
         calls.t_s = self._t_s
         self._carrier = carrier = Carrier(
             self._names, self._outbox.post, clock.now_s, end_s=config.time.duration_s
@@ -105,7 +105,7 @@ class LockstepHost:
         self._guarded = LockstepHalf(
             self._half,
             config.timeouts,
-            meeting=self._meeting,
+            barrier=self._barrier,
             executor=executor,
             on_hang=self._leave_hanging,
         )
@@ -113,8 +113,8 @@ class LockstepHost:
             config=config,
             account=account,
             clock=clock,
-            crew=self._crew,
-            meeting=self._meeting,
+            pool=self._pool,
+            barrier=self._barrier,
             outbox=self._outbox,
             half=self._guarded,
             journal=self._journal,
@@ -129,18 +129,18 @@ class LockstepHost:
 
     def run(self) -> int:
         """Run to the end and return the process's exit code."""
-        is_detached, meeting = self._launch.is_detached, self._meeting
+        is_detached, barrier = self._launch.is_detached, self._barrier
         if not is_detached:
             end_after_hang_up(self._line_fd, 2 * self._config.timeouts.shutdown_s + HANG_GRACE_S)
-        terminated = partial(meeting.end, HOST, "ended by SIGTERM", status="interrupted")
-        heed_signals(meeting.reactor, terminated, is_detached=is_detached)
+        terminated = partial(barrier.end, HOST, "ended by SIGTERM", status="interrupted")
+        heed_signals(barrier.reactor, terminated, is_detached=is_detached)
         self._operator.emit({"event": "state", "state": self._machine.state.value})
         try:
             with contextlib.suppress(RunEnds):
                 self._script()
             self._shut_down()
         finally:
-            self._crew.end_left()
+            self._pool.end_left()
         return self._close()
 
     # The script -----------------------------------------------------------------------------------
@@ -156,7 +156,7 @@ class LockstepHost:
                 self._account.duration_s = duration_s = number / tick_hz
                 break
             self._absences.bring_back(number, self._settle)
-            self._meeting.exchange((frames.TICK, number), self._outbox.boxes)
+            self._barrier.exchange((frames.TICK, number), self._outbox.boxes)
             self._account.ticks, self._account.ticked_s = number + 1, number / tick_hz
             self._settle()
             self._settle_conditions()
@@ -166,8 +166,8 @@ class LockstepHost:
         self._finish()
 
     def _set_up(self) -> None:
-        timeouts, meeting = self._config.timeouts, self._meeting
-        meeting.await_all(
+        timeouts, barrier = self._config.timeouts, self._barrier
+        barrier.await_all(
             timeouts.agents_ready_s, "has not loaded the agent's half", "agents_ready_s"
         )
         self._account.set_states("ready")
@@ -190,12 +190,12 @@ class LockstepHost:
         for number, name in enumerate(self._names):
             data = self._guarded.call("initial_data", name, limit_s=limit_s)
             initial.append((number, pack(data)))
-            meeting.serve()
+            barrier.serve()
         self._fire(HostEvent.SETUP_FINISHED)
         self._absences.begin()
-        for worker in self._crew.workers:
-            meeting.order(worker, frames.SETUP, [initial[number] for number in worker.agents])
-        meeting.await_all(timeouts.agent_setup_s, "has not set itself up", "agent_setup_s")
+        for worker in self._pool.workers:
+            barrier.order(worker, frames.SETUP, [initial[number] for number in worker.agents])
+        barrier.await_all(timeouts.agent_setup_s, "has not set itself up", "agent_setup_s")
         self._settle()
 
     def _start(self) -> None:
@@ -204,7 +204,7 @@ class LockstepHost:
         freeze_garbage()  # what set-up made stays: no collection walks it in mid-run
         self._account.t0_utc = utc_now_iso()
         self._account.began_s = monotonic()
-        self._timeline.accept_orders(self._directory.parent, self._meeting.reactor, self._log)
+        self._timeline.accept_orders(self._directory.parent, self._barrier.reactor, self._log)
         self._guarded.call("start", self._clock.t_s)
         self._half.begin_timer(self._clock.t_s)
         self._guarded.call_timer(self._clock.t_s)
@@ -220,7 +220,7 @@ class LockstepHost:
                 self._timeline.run_due()
             else:
                 self._guarded.call_timer(self._clock.t_s)
-            self._meeting.serve()
+            self._barrier.serve()
         self._clock.t_s = t_s
         self._faults.release()
         self._carrier.hand_over()
@@ -230,7 +230,7 @@ class LockstepHost:
         for _ in range(DRAIN_ROUNDS_MAX):
             if not any(self._outbox.boxes):
                 break
-            self._meeting.exchange((frames.DRAIN, self._clock.t_s), self._outbox.boxes)
+            self._barrier.exchange((frames.DRAIN, self._clock.t_s), self._outbox.boxes)
             self._settle()
         self._outbox.give_up()
 
@@ -238,16 +238,16 @@ class LockstepHost:
         timeouts, account = self._config.timeouts, self._account
         account.wall_s = monotonic() - (account.began_s or 0.0)
         self._fire(HostEvent.AGENTS_COMPLETE)
-        for worker in self._crew.workers:
-            self._meeting.order(worker, frames.FINISH, self._clock.t_s)
+        for worker in self._pool.workers:
+            self._barrier.order(worker, frames.FINISH, self._clock.t_s)
         limit_s, setting = max((timeouts.tick_s, "tick_s"), (timeouts.complete_s, "complete_s"))
-        self._meeting.await_all(limit_s, "has not summed itself up", setting)
+        self._barrier.await_all(limit_s, "has not summed itself up", setting)
         self._absences.take()
         self._conditions.end_s = -math.inf  # what is met from now on is noted, and nothing follows
         self._timeline.runner.close()
         self._take_conditions()
         self._conditions.settle(self._journal)
-        for answer in self._crew.answers():
+        for answer in self._pool.answers():
             for number, summary, deadlines_broken, counts, newest in answer[frames.LOSSES + 1]:
                 account.agents[number].summary = summary
                 account.agents[number].deadlines_broken += deadlines_broken
@@ -255,7 +255,7 @@ class LockstepHost:
                 account.agents[number].columns = newest
         account.set_states("complete")
         # The view's last picture stays on the terminal: without this one of some moment before the end.
-        self._meeting.operator.emit(account.progress(self._clock.t_s, monotonic()))
+        self._barrier.operator.emit(account.progress(self._clock.t_s, monotonic()))
         account.simulation = self._guarded.finish()
         self._conditions.settle(self._journal)
         self._outbox.give_up()
@@ -273,20 +273,20 @@ class LockstepHost:
     def _take_messages(self) -> None:
         """Hand what the agents sent to the half, in the order of agents and of sending."""
         names, accounts, half = self._names, self._account.agents, self._guarded
-        for number, service, body in self._meeting.messages():
+        for number, service, body in self._barrier.messages():
             accounts[number].up[service] += 1
             message = decode(body)
             if isinstance(message, ConditionMet):
                 self._conditions.hear(names[number], message.number, message.t_s)
             else:
                 half.take(names[number], message, SERVICES[service])
-            self._meeting.serve()
+            self._barrier.serve()
 
     # Conditions -----------------------------------------------------------------------------------
 
     def _take_conditions(self) -> None:
         """Hear what agents tell of conditions; what they sent besides is too late."""
-        for number, service, body in self._meeting.messages():
+        for number, service, body in self._barrier.messages():
             account, message = self._account.agents[number], decode(body)
             account.up[service] += 1
             if isinstance(message, ConditionMet):
@@ -303,16 +303,16 @@ class LockstepHost:
         """
         self._conditions.tap.look(self._clock.t_s)
         self._conditions.settle(self._journal)
-        if self._meeting.ending is not None:
+        if self._barrier.ending is not None:
             raise RunEnds
 
     def _end(self, who: str, reason: str, status: str) -> None:
-        self._meeting.end(who, reason, status=status)
+        self._barrier.end(who, reason, status=status)
 
     # The end --------------------------------------------------------------------------------------
 
     def _shut_down(self) -> None:
-        ending, reason = self._meeting.ending, None
+        ending, reason = self._barrier.ending, None
         self._account.ending = ending
         if ending is None:
             self._fire(HostEvent.STOP_ORDERED)
@@ -321,7 +321,7 @@ class LockstepHost:
             self._fire(HostEvent.EMERGENCY)
             self._journal.event("emergency", who=ending.who, reason=ending.reason)
             self._log("critical", f"emergency shutdown: {reason}")
-        missing = self._account.not_stopped = self._meeting.stop_workers(reason)
+        missing = self._account.not_stopped = self._barrier.stop_workers(reason)
         if missing:
             self._log("error", f"{', '.join(missing)}: no word that records are closed")
         self._fire(HostEvent.AGENTS_STOPPED)
@@ -337,7 +337,7 @@ class LockstepHost:
         self._timeline.close()
         code = hand_over(self._account.result(), self._directory, self._operator)
         self._calls.close()
-        self._meeting.reactor.close()
+        self._barrier.reactor.close()
         return code
 
     def _leave_hanging(self, reason: str) -> None:

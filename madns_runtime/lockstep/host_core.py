@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from madns_runtime.config import RunConfig
-from madns_runtime.lockstep.barrier import Meeting
+from madns_runtime.lockstep.barrier import Barrier
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.host_half import LockstepHalf
 from madns_runtime.lockstep.messages import Outbox
 from madns_runtime.lockstep.result import RunAccount
-from madns_runtime.lockstep.workers import Workers
+from madns_runtime.lockstep.workers import WorkerPool
 from madns_runtime.recording.run_journal import RunJournal
 
 
@@ -21,8 +21,8 @@ class LockstepCore:
     config: RunConfig
     account: RunAccount
     clock: SimulatedClock
-    crew: Workers
-    meeting: Meeting
+    pool: WorkerPool
+    barrier: Barrier
     """Where workers are told and awaited."""
     outbox: Outbox
     """The host's messages."""

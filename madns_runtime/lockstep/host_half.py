@@ -22,7 +22,7 @@ from typing import Any
 
 from madns_runtime.config import Timeouts
 from madns_runtime.faults.message_faults import MessageFaults
-from madns_runtime.lockstep.barrier import STACK_HINT, Meeting
+from madns_runtime.lockstep.barrier import STACK_HINT, Barrier
 from madns_runtime.lockstep.result import EarlyEnd
 from madns_runtime.lockstep.workers import WorkerProcess
 from madns_runtime.plugin.api import HOST
@@ -44,7 +44,7 @@ class LockstepHalf:
     Args:
         half: The plug-in's.
         timeouts: How long its calls and jobs may take.
-        meeting: Where jobs are waited for and faults end the run.
+        barrier: Where jobs are waited for and faults end the run.
         executor: Who does the jobs.
         on_hang: Called, in another thread, with the reason when a call does not return; must not return.
     """
@@ -54,16 +54,16 @@ class LockstepHalf:
         half: HostHalf,
         timeouts: Timeouts,
         *,
-        meeting: Meeting,
+        barrier: Barrier,
         executor: Executor,
         on_hang: Callable[[str], None],
     ) -> None:
         self._half = half
         self._timeouts = timeouts
-        self._meeting = meeting
+        self._barrier = barrier
         self._on_hang = on_hang
         self._faults: MessageFaults | None = None
-        self._jobs = JobRunner(meeting.reactor, executor, self._job_done)
+        self._jobs = JobRunner(barrier.reactor, executor, self._job_done)
         self.close = self._jobs.close
         self._outstanding: deque[int] = deque()
         self._finished: dict[int, Future[Any]] = {}
@@ -108,7 +108,7 @@ class LockstepHalf:
         elif half.repeats > REPEATS_UNTIMED and self._standing.is_over():
             asked = f"{half.name}.timer asked {half.repeats} times in a row for t = {t_s:g} s"
             why = f"for longer than {limit_s:g} s: simulated time stands (limit: timeouts.tick_s)"
-            self._meeting.fail(HOST, f"{asked}, {why}")
+            self._barrier.fail(HOST, f"{asked}, {why}")
 
     def finish(self) -> Any:
         """
@@ -160,7 +160,7 @@ class LockstepHalf:
         try:
             return call()
         except HalfFailed as failure:
-            self._meeting.fail(HOST, str(failure))
+            self._barrier.fail(HOST, str(failure))
         finally:
             self._under_way = None
 
@@ -170,24 +170,24 @@ class LockstepHalf:
         while self._outstanding:
             job = self._outstanding[0]
             limit_s = self._timeouts.host_setup_s
-            self._meeting.wait(partial(self._finished.__contains__, job), limit_s, self._late)
+            self._barrier.wait(partial(self._finished.__contains__, job), limit_s, self._late)
             self._outstanding.popleft()
             future = self._finished.pop(job)
             self._guard("result", partial(self._half.take_job, job, future))
             settled += 1
             if settled > REPEATS_MAX:
                 text = f"result submitted {REPEATS_MAX} jobs in a row: simulated time stands"
-                self._meeting.fail(HOST, f"{self._half.name}.{text}")
+                self._barrier.fail(HOST, f"{self._half.name}.{text}")
 
     def _late(self, worker: WorkerProcess | None, limit_s: float) -> EarlyEnd:
         del worker  # none is awaited
         job = self._outstanding[0]
         reason = f"{self._half.name}: job {job} has not ended within {limit_s:g} s"
-        return EarlyEnd(who=HOST, reason=f"{reason}{self._meeting.when()}")
+        return EarlyEnd(who=HOST, reason=f"{reason}{self._barrier.when()}")
 
     def _job_done(self, job: int, future: Future[Any]) -> None:
         self._finished[job] = future
-        self._meeting.reactor.stop()
+        self._barrier.reactor.stop()
 
     def _watch_calls(self) -> None:
         watched, limit = None, GrantedLimit(0.0)
@@ -200,6 +200,6 @@ class LockstepHalf:
             elif present is not None and limit.is_over():
                 faulthandler.dump_traceback(file=sys.__stderr__ or 2)
                 call, limit_s = present
-                when = self._meeting.when()
+                when = self._barrier.when()
                 self._on_hang(f"{call} has not returned within {limit_s:g} s{when}; {STACK_HINT}")
                 os._exit(1)

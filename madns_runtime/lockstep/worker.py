@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 from madns_runtime.errors import MadnsError
 from madns_runtime.faults.step_faults import StepFaults
 from madns_runtime.lockstep import frames
-from madns_runtime.lockstep.agent import Crewmates, LockstepAgent
+from madns_runtime.lockstep.agent import LockstepAgent, WorkerCore
 from madns_runtime.lockstep.assignment import Assignment
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import POSITIONS, encode_frame
@@ -105,7 +105,7 @@ class Worker:
         """Whether the run goes on without an agent that fails now."""
         self._forks = StrayForks(assignment.position)
         self._faults: dict[int, StepFaults] = {}
-        self._mates: Crewmates
+        self._core: WorkerCore
         self._flush_interval_s = config.recording.flush_interval_s
         self._flushed_s = monotonic()
         self._orders: dict[int, Callable[..., bytes]] = {
@@ -154,7 +154,7 @@ class Worker:
         config, index = self._assignment.config, self._assignment.agents[0]
         self._position[0] = index * POSITIONS + frames.LOADING
         try:
-            self._mates = Crewmates(
+            self._core = WorkerCore(
                 config=config,
                 directory=self._assignment.directory,
                 program=RoleProgram.load(config, "agent"),
@@ -162,7 +162,7 @@ class Worker:
                 devices=self._assignment.devices,
             )
             for index in self._assignment.agents:
-                self._agents.append(LockstepAgent(index, self._mates))
+                self._agents.append(LockstepAgent(index, self._core))
         except MadnsError as error:
             raise AgentFailed(index, str(error)) from error
         return encode_frame(frames.READY)
@@ -204,7 +204,7 @@ class Worker:
 
     def _step_all(self, agents: Iterator[LockstepAgent], tick: Tick) -> bool:
         """Step one agent after the other; return False after one that is lost by it."""
-        t_s, position, has_medium = tick.t_s, self._position, self._mates.program.has_medium
+        t_s, position, has_medium = tick.t_s, self._position, self._core.program.has_medium
         agent, forks = None, self._forks
         try:
             for agent in agents:
@@ -231,7 +231,7 @@ class Worker:
         return True
 
     def _unhindered(self, number: int, t_s: float) -> Iterator[LockstepAgent]:
-        """Yield whom no fault keeps from the step of tick *number*; of the others what they recorded last still holds."""
+        """Yield the agents that no fault keeps from the step of tick *number*; what the others recorded last still holds."""
         for agent in self._agents:
             faults = self._faults.get(agent.index)
             if faults is None or not faults.withholds(number):
@@ -260,7 +260,7 @@ class Worker:
 
     def _finish(self, t_s: float) -> bytes:
         self._clock.t_s = t_s
-        summaries, outbox = [], self._mates.outbox
+        summaries, outbox = [], self._core.outbox
         for agent in self._agents:
             self._position[0] = agent.index * POSITIONS + frames.FINISHING
             try:
@@ -277,7 +277,7 @@ class Worker:
         return answer
 
     def _done(self, newest: Sequence[tuple[int, list[Value]]] = ()) -> bytes:
-        outbox = self._mates.outbox
+        outbox = self._core.outbox
         losses = (self._losses.take(),) if self._losses else ()
         answer = encode_frame(frames.DONE, outbox, newest, *losses)
         outbox.clear()
@@ -328,7 +328,7 @@ class Worker:
             self._position[0] = index * POSITIONS + frames.LOADING
             devices = self._losses.devices_of(index)
             try:
-                agent = LockstepAgent(index, self._mates, incarnation=incarnation, devices=devices)
+                agent = LockstepAgent(index, self._core, incarnation=incarnation, devices=devices)
             except MadnsError as error:
                 raise AgentFailed(index, str(error)) from error
             self._agents = sorted((*self._agents, agent), key=lambda each: each.index)

@@ -59,9 +59,9 @@ class WorkerProcess:
         return (index, METHODS[doing]) if is_busy else (self.agents[0], "")
 
 
-class Workers:
+class WorkerPool:
     """
-    All workers of a run. Make it before any thread is started: it forks.
+    All workers of a run. It forks: make it before any thread is started.
 
     Args:
         launch: The run.

@@ -12,14 +12,14 @@ from harness import full_disk
 from madns_runtime.config import Agents, RunConfig, Timeouts, TimeSettings
 from madns_runtime.errors import MachineError, MessageTooLarge, PeerError
 from madns_runtime.lockstep import frames, workers
-from madns_runtime.lockstep.barrier import Meeting
+from madns_runtime.lockstep.barrier import Barrier
 from madns_runtime.lockstep.clock import SimulatedClock
 from madns_runtime.lockstep.frames import FRAME_BYTES_MAX, HEAD, FrameReader, encode_frame
 from madns_runtime.lockstep.messages import LARGEST_BYTES, Allowance, decode, encode
 from madns_runtime.lockstep.partition import share_out
 from madns_runtime.lockstep.recorder import open_journal
 from madns_runtime.lockstep.result import EarlyEnd, RunAccount
-from madns_runtime.lockstep.workers import WorkerProcess, Workers
+from madns_runtime.lockstep.workers import WorkerPool, WorkerProcess
 from madns_runtime.protocol.datagram import MESSAGE_BYTES_MAX
 from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Service
@@ -166,7 +166,7 @@ def test_a_worker_that_only_closes_its_line_does_not_live_on(tmp_path, monkeypat
     here, _ = socket.socketpair()
     with subprocess.Popen(["sleep", "60"]) as process:
         worker = WorkerProcess(range(1), process.pid, here, memoryview(bytes(8)).cast("q"))
-        how = Workers(config(), tmp_path, ()).let_go(worker)
+        how = WorkerPool(config(), tmp_path, ()).let_go(worker)
 
     assert how == "has closed its line to the host and not ended"
     assert not os.path.exists(f"/proc/{process.pid}")
@@ -190,18 +190,18 @@ def test_a_run_on_a_full_disk_still_comes_to_its_end(tmp_path, monkeypatch):
 def test_a_failure_stands_whatever_its_worker_answers_behind_it():
     """As a process that came back from a plug-in's call tells it, and the worker itself its order, in one reading."""
     heard = []
-    crew = SimpleNamespace(
+    pool = SimpleNamespace(
         listen=lambda reactor, *, on_frame, on_lost: heard.append(on_frame), awaited=None
     )
     launch = SimpleNamespace(config=SimpleNamespace(timeouts=Timeouts()), is_detached=False)
     fds = os.pipe()
-    meeting = Meeting(launch, crew, account=None, clock=SimulatedClock(0.0), fds=fds, pending=b"")
+    barrier = Barrier(launch, pool, account=None, clock=SimulatedClock(0.0), fds=fds, pending=b"")
     worker = SimpleNamespace(answer=None)
 
     heard[0](worker, [frames.FAILED, 3, "it forked"])
     heard[0](worker, [frames.DONE, [], []])
 
     assert worker.answer == [frames.FAILED, 3, "it forked"]
-    meeting.reactor.close()
+    barrier.reactor.close()
     for fd in fds:
         os.close(fd)
