@@ -25,7 +25,7 @@ from madns_runtime.realtime.supervisor import Supervisor
 from madns_runtime.recording.access import apply_access
 
 USAGE = "usage: madns-agent [--launch SOCKET]"
-SEAT_TAKEN = (
+NOTHING_GIVEN = (
     "the run gave nothing to start with: this agent has been started already, or the run is over"
 )
 
@@ -39,7 +39,7 @@ def main() -> None:
             die_with_parent()  # until the loop runs: loading a plug-in may take for ever
             document, pending = read_launch(0)
         else:
-            document, pending = read_launch(fds[0], if_none=SEAT_TAKEN)
+            document, pending = read_launch(fds[0], if_none=NOTHING_GIVEN)
         launch = from_mapping(AgentLaunch, document)
         apply_access(launch.config.recording.access)
         code = _supervise(launch, fds, pending)

@@ -99,7 +99,7 @@ class Absences:
         """End a run of which no agent is left, nor returns before it is over."""
         agents = self._account.agents
         is_waiting = any(due_s < self._duration_s for due_s, _ in self._returns)
-        if all(agent.is_lost for agent in agents) and not (is_waiting and self._pool.are_living):
+        if all(agent.is_lost for agent in agents) and (self._pool.have_all_ended or not is_waiting):
             names = self._account.names
             reasons = dict.fromkeys(agent.reason or "" for agent in agents)
             self._barrier.fail(", ".join(names), "; ".join(reasons))
@@ -122,7 +122,7 @@ class Absences:
         while returns and returns[0][0] <= t_s + TIME_EPSILON_S:
             due.append(heapq.heappop(returns)[1])
         returning = [index for index in sorted(set(due)) if self._account.agents[index].is_lost]
-        if returning and self._pool.are_living:
+        if returning and not self._pool.have_all_ended:
             self._start_anew(number, returning, settle)
 
     def _start_anew(self, number: int, returning: list[int], settle: Callable[[], None]) -> None:
@@ -141,7 +141,7 @@ class Absences:
         for place in sorted(orders):
             worker = self._pool.workers[place]
             self._barrier.order(worker, frames.RETURN, number, orders[place])
-        self._barrier.await_told("has not set up the agents that return")
+        self._barrier.await_ordered("has not set up the agents that return")
         settle()
         for index in returning:
             if not account.agents[index].is_lost:
@@ -171,5 +171,5 @@ class Absences:
             own = [index for index in indices if index in worker.agents]
             told = dataclasses.astuple(fault)
             self._barrier.order(worker, frames.FAULT, self._clock.t_s, told, own)
-        self._barrier.await_told("has not begun a fault")
+        self._barrier.await_ordered("has not begun a fault")
         self.heed()

@@ -76,7 +76,7 @@ class Barrier:
         self.goes_on = False
         """Whether the run goes on without an agent that is lost now."""
         self.is_open = True
-        """Whether an ending would be news."""
+        """Whether an ending is still noted; none is once the workers are told to stop."""
         self.ending: EarlyEnd | None = None
         """Why the run ends before its time, if it does."""
         self._late: tuple[GrantedLimit, Callable[[], EarlyEnd | None]] | None = None
@@ -159,8 +159,8 @@ class Barrier:
         for worker in self._pool.workers:
             worker.answer = None if worker.has_ended else [frames.DONE, (), ()]
 
-    def await_told(self, late: str) -> None:
-        """Wait until those have answered that were given an order; see `await_all`."""
+    def await_ordered(self, late: str) -> None:
+        """Wait for the answers of the workers that were given an order; see `await_all`."""
         self.await_all(self._timeouts.tick_s, late)
 
     def wait(

@@ -127,7 +127,7 @@ class WorkerPool:
         return all(worker.has_ended for worker in self.workers)
 
     def worker_for(self, agent: int) -> WorkerProcess | None:
-        """Return the worker of an agent that returns: its own, or if that has ended one that lives; None: none does."""
+        """Return the worker for an agent that returns: its own, another where that has ended; None where all have."""
         before = self._by_agent[agent]
         living = [worker for worker in self.workers if not worker.has_ended]
         if before in living or not living:
@@ -137,11 +137,6 @@ class WorkerPool:
         after.agents = sorted((*after.agents, agent))
         self._by_agent[agent] = after
         return after
-
-    @property
-    def are_living(self) -> bool:
-        """Whether a worker is left."""
-        return not self.have_all_ended
 
     def number_of(self, worker: WorkerProcess) -> int:
         """Return a worker's place among all."""
@@ -201,7 +196,7 @@ class WorkerPool:
             os.kill(worker.pid, signal.SIGKILL)
 
     def end_left(self) -> list[WorkerProcess]:
-        """Kill who lives still, and return them."""
+        """Kill the workers that still live, and return them."""
         left = [worker for worker in self.workers if not worker.has_ended]
         for worker in left:
             with contextlib.suppress(ProcessLookupError):

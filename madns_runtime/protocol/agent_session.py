@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from madns_runtime.config import Timeouts
-from madns_runtime.protocol import events as told
-from madns_runtime.protocol import messages
+from madns_runtime.protocol import events, messages
 from madns_runtime.protocol.codec import (
     NO_DATA,
     MalformedMessage,
@@ -123,7 +122,7 @@ class AgentSession:
         self._t0_host_s = -math.inf
         """Simulated time zero on the host's clock."""
         self._started_s = now_s
-        self._held: list[told.HostDataReceived] = []
+        self._held: list[events.HostDataReceived] = []
         self.held_dropped_count = 0
         self.malformed_count = 0
         self._send(
@@ -170,7 +169,7 @@ class AgentSession:
         """Declare an emergency and tell the host; no effect when already ending."""
         if self._machine.allows(AgentEvent.EMERGENCY):
             self._send(messages.EmergencyShutdown(self.identity.name, reason), Service.SYNC, now_s)
-            self._end(told.EmergencyOrdered(self.identity.name, reason))
+            self._end(events.EmergencyOrdered(self.identity.name, reason))
 
     def send(
         self, payload: Any, service: Service, now_s: float, *, deadline_s: float | None = None
@@ -269,7 +268,7 @@ class AgentSession:
         return self._events.popleft() if self._events else None
 
     def _fire(self, event: AgentEvent) -> None:
-        self._events.append(told.AgentStateEntered(self._machine.fire(event)))
+        self._events.append(events.AgentStateEntered(self._machine.fire(event)))
 
     def _send(self, message: Message, service: Service, now_s: float) -> None:
         self.link.send_urgent(encode_message(message), service, now_s)
@@ -293,27 +292,27 @@ class AgentSession:
                 self.clock.add_exchange(t_agent_s, t_host_received_s, t_host_sent_s, now_s)
                 if self._is_clock_unused(now_s):
                     self.clock.settle(now_s, is_unused=True)
-                self._events.append(told.ClockEstimated())
+                self._events.append(events.ClockEstimated())
                 if self._ready_due_s is not None and self._is_clock_known(now_s):
                     self._say_ready(now_s)
             case messages.SimulationSetup(initial, t_s):
-                self._move(AgentEvent.SETUP_RECEIVED, told.SetupReceived(initial, t_s))
+                self._move(AgentEvent.SETUP_RECEIVED, events.SetupReceived(initial, t_s))
             case messages.SimulationStart(t0_host_s):
                 if self._machine.allows(AgentEvent.START_RECEIVED):
                     self.clock.settle(now_s)
                     self._start_is_near(t0_host_s, now_s)
-                self._move(AgentEvent.START_RECEIVED, told.StartReceived(t0_host_s))
+                self._move(AgentEvent.START_RECEIVED, events.StartReceived(t0_host_s))
             case messages.SystemStop():
-                self._move(AgentEvent.STOP_RECEIVED, told.StopReceived())
+                self._move(AgentEvent.STOP_RECEIVED, events.StopReceived())
             case messages.EmergencyShutdown(who, reason):
-                self._end(told.EmergencyOrdered(who, reason))
+                self._end(events.EmergencyOrdered(who, reason))
             case messages.Expelled(reason):
-                self._end(told.ExpelledFromRun(reason))
+                self._end(events.ExpelledFromRun(reason))
             case _:
                 self.malformed_count += 1  # a message that only agents send
 
     def _take_data(self, payload: Any) -> None:
-        event = told.HostDataReceived(payload)
+        event = events.HostDataReceived(payload)
         if self.state not in (AgentState.AGENT_READY, AgentState.SIMULATION_SETUP):
             self._events.append(event)
         elif len(self._held) < HELD_MAX:
@@ -329,7 +328,7 @@ class AgentSession:
         else:
             self.malformed_count += 1
 
-    def _end(self, outcome: told.EmergencyOrdered | told.ExpelledFromRun) -> None:
+    def _end(self, outcome: events.EmergencyOrdered | events.ExpelledFromRun) -> None:
         if self._machine.allows(AgentEvent.EMERGENCY):
             self._ready_due_s = None
             self._move(AgentEvent.EMERGENCY, outcome)
@@ -374,7 +373,7 @@ class AgentSession:
             deadline_s = self._state_deadline_s
             if self.link.is_flushed or (deadline_s is not None and now_s >= deadline_s):
                 self._fire(AgentEvent.SERVER_STOPPED)
-                self._events.append(told.SessionEnded())
+                self._events.append(events.SessionEnded())
             return
         if state not in AGENT_LIVE:
             return

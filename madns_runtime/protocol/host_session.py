@@ -13,8 +13,7 @@ from typing import Any, Literal
 
 from madns_runtime import __version__
 from madns_runtime.config import Timeouts
-from madns_runtime.protocol import events as told
-from madns_runtime.protocol import messages
+from madns_runtime.protocol import events, messages
 from madns_runtime.protocol.codec import NO_DATA, MalformedMessage, decode_data, decode_message
 from madns_runtime.protocol.datagram import PREFIX_BYTES
 from madns_runtime.protocol.events import HostSessionEvent, Phase
@@ -130,7 +129,7 @@ class HostSession:
             return
         self._fire(HostEvent.EMERGENCY)
         self._wait.begin(now_s, self._timeouts.shutdown_s)
-        self._events.append(told.EmergencyDeclared(who, reason))
+        self._events.append(events.EmergencyDeclared(who, reason))
         for peer in self.peers.values():
             if peer.link is not None and peer.phase is not Phase.STOPPED:
                 self._links.send(peer, messages.EmergencyShutdown(who, reason), Service.SYNC, now_s)
@@ -265,11 +264,11 @@ class HostSession:
             case _ if peer.phase is Phase.LOST:
                 self._send_expelled(peer, now_s)
             case messages.SimulationData(payload):
-                self._events.append(told.AgentDataReceived(peer.name, payload, service))
+                self._events.append(events.AgentDataReceived(peer.name, payload, service))
             case messages.Transmission(sent_s=t_s) | messages.ConditionMet(t_s=t_s) if isfinite(
                 t_s
             ):
-                self._events.append(told.AgentDataReceived(peer.name, message))
+                self._events.append(events.AgentDataReceived(peer.name, message))
             case messages.Ping(t_agent_s, report):
                 peer.report = report or peer.report
                 peer.pings.append((t_agent_s, now_s))
@@ -294,7 +293,7 @@ class HostSession:
             self._progress(now_s)
         elif self.state in (HostState.HOST_SIMULATION_READY, HostState.SIMULATION_START):
             self._roster.move(peer, Phase.READY)
-            self._events.append(told.AgentRejoining(peer.name))
+            self._events.append(events.AgentRejoining(peer.name))
         else:
             word = messages.EmergencyShutdown("host", "the run is already ending")
             self._links.send(peer, word, Service.SYNC, now_s)
@@ -303,7 +302,7 @@ class HostSession:
         if self.state is HostState.SIMULATION_START:
             self._start_peer(peer, now_s)
             peer.loss_reason = None
-            self._events.append(told.AgentRejoined(peer.name))
+            self._events.append(events.AgentRejoined(peer.name))
         else:
             self._roster.move(peer, Phase.SIMULATION_READY)
             self._progress(now_s)
@@ -327,7 +326,7 @@ class HostSession:
             peer.loss_reason = None  # said once an incarnation
 
     def _fire(self, event: HostEvent) -> None:
-        self._events.append(told.HostStateEntered(self._machine.fire(event)))
+        self._events.append(events.HostStateEntered(self._machine.fire(event)))
 
     def _lose(self, reasons: Mapping[str, str], now_s: float) -> None:
         """Take agents, by name, for lost: an emergency, unless the run may lose them and some are left."""
@@ -354,18 +353,18 @@ class HostSession:
         if state is HostState.HOST_STARTUP:
             self._fire(HostEvent.AGENTS_READY)
             self._wait.begin(now_s, self._timeouts.host_setup_s)
-            self._events.append(told.AgentsReady())
+            self._events.append(events.AgentsReady())
         elif state is HostState.HOST_SIMULATION_READY:
-            self._events.append(told.AgentsSimulationReady())
+            self._events.append(events.AgentsSimulationReady())
         else:
             self._fire(HostEvent.AGENTS_COMPLETE)
             self._wait.begin(now_s, self._timeouts.shutdown_s)
-            self._events.append(told.AgentsComplete())
+            self._events.append(events.AgentsComplete())
 
     def _stop(self, now_s: float, missing: tuple[str, ...]) -> None:
         self._fire(HostEvent.AGENTS_STOPPED)
         self._wait.begin(now_s, self._timeouts.shutdown_s)
-        self._events.append(told.AgentsStopped(missing))
+        self._events.append(events.AgentsStopped(missing))
 
     def _check_state_deadline(self, now_s: float) -> None:
         """End a wait that is over: whoever did not answer is lost, all of them named at once."""

@@ -14,7 +14,7 @@ from madns_runtime.config import AgentLaunch
 from madns_runtime.hardware.port import NO_HARDWARE
 from madns_runtime.plugin.context import PeerContext
 from madns_runtime.plugin.half import Half, HalfFailed, RoleProgram
-from madns_runtime.protocol import events as told
+from madns_runtime.protocol import events
 from madns_runtime.protocol.codec import NO_DATA
 from madns_runtime.protocol.messages import (
     ActionOrder,
@@ -79,7 +79,7 @@ class AgentRunner:
         counted: Mapping[int, int],
     ) -> None:
         self.name = name = seat.name
-        self._calls, self._seat = seat.calls.page, seat.number
+        self._calls, self._number = seat.calls.page, seat.number
         self._config = config = launch.config
         self._program, self._reactor, self._on_ended = program, reactor, on_ended
         self._port = AgentPort(
@@ -140,18 +140,18 @@ class AgentRunner:
         calls = TickCalls(
             prepare=self._prepare_tick if self._program.has_medium or self._has_devices else None,
             step=self.half.simulation.step,
-            came_back=self._reactor.end_if_forked,
+            end_if_forked=self._reactor.end_if_forked,
             failed=self._step_failed,
             ended=self._ticks_over,
             is_running=self._is_running,
-            say_how_it_is=self._say_how_it_is,
+            report_if_due=self._report_if_due,
         )
         return PacedTicks(
             seat, self._config, self._pack.phase_s, port=self._port, recorder=recorder, calls=calls
         )
 
     def start(self) -> None:
-        """Begin: says hello at once."""
+        """Begin, and say hello at once."""
         self._recorder.start()
         self._journal.event("start", pid=os.getpid())
         if warning := self._port.process.socket.warning:
@@ -177,7 +177,7 @@ class AgentRunner:
         message = self._session.receive_data(data, monotonic())
         if message is not NO_DATA and self._takes_data:
             calls = self._calls
-            calls[AGENT], calls[METHOD] = self._seat, RECEIVE
+            calls[AGENT], calls[METHOD] = self._number, RECEIVE
             try:
                 self._receive(message)
             except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
@@ -193,11 +193,11 @@ class AgentRunner:
         # What waits in the socket is heard before the host is blamed for silence.
         self._port.process.drain()
         heard_s = monotonic()
-        self._spans(Span(Cause.RECEIVING, self._seat, began_s, heard_s))
+        self._spans(Span(Cause.RECEIVING, self._number, began_s, heard_s))
         if not self._is_closed:
             self._session.handle_timer(heard_s)
             self._pump()
-        self._spans(Span(Cause.HOUSEKEEPING, self._seat, heard_s, monotonic()))
+        self._spans(Span(Cause.HOUSEKEEPING, self._number, heard_s, monotonic()))
 
     def _pump(self) -> None:
         """Carry out the session's events, send what is due, arm its timer."""
@@ -209,31 +209,31 @@ class AgentRunner:
         if not self._is_closed:
             self._port.flush()
 
-    def _handle(self, event: told.AgentSessionEvent) -> None:
+    def _handle(self, event: events.AgentSessionEvent) -> None:
         match event:
-            case told.HostDataReceived(payload):
+            case events.HostDataReceived(payload):
                 self._take(payload)
-            case told.ClockEstimated():
+            case events.ClockEstimated():
                 if self._session.state is AgentState.RUN_SIMULATION:
                     self._records.clock(self._session.clock, monotonic())
                     if self._port.now_s() < 0.0:  # what is known better now moves the start
                         self._port.process.follow_clock()
                         self._device_time.tell()
-            case told.AgentStateEntered(state):
+            case events.AgentStateEntered(state):
                 self._journal.event("state", state=state.value)
-            case told.SetupReceived(initial, t_s):
+            case events.SetupReceived(initial, t_s):
                 self._port.rejoin_at(t_s)
                 self._set_up(initial)
-            case told.StartReceived(t0_host_s):
+            case events.StartReceived(t0_host_s):
                 self._start_run(t0_host_s)
-            case told.StopReceived():
+            case events.StopReceived():
                 self._outcome = AgentOutcome(as_ordered=True, is_run_over=True)
                 self._close_records()
-            case told.EmergencyOrdered(who, reason):
+            case events.EmergencyOrdered(who, reason):
                 self._end_early(f"{who}: {reason}", is_own=who == self.name)
-            case told.ExpelledFromRun(reason):
+            case events.ExpelledFromRun(reason):
                 self._end_early(f"expelled by the host: {reason}", is_own=True)
-            case told.SessionEnded():
+            case events.SessionEnded():
                 self._close()
             case _:
                 assert_never(event)
@@ -298,11 +298,11 @@ class AgentRunner:
             return False
         return not self._has_devices or self._look_at_devices()
 
-    def _say_how_it_is(self, now_s: float) -> None:
+    def _report_if_due(self, now_s: float) -> None:
         if now_s >= self._session.ping_due_s and not self._is_closed:
             self._session.handle_timer(now_s)
             self._pump()
-            self._spans(Span(Cause.HOUSEKEEPING, self._seat, now_s, monotonic()))
+            self._spans(Span(Cause.HOUSEKEEPING, self._number, now_s, monotonic()))
         if now_s >= self._records.usage_due_s:
             self._record_usage()
 
@@ -375,14 +375,14 @@ class AgentRunner:
             self._records.usage(began_s)
             self._port.process.account.look()
             self._device_time.tell()
-            self._spans(Span(Cause.HOUSEKEEPING, self._seat, began_s, monotonic()))
+            self._spans(Span(Cause.HOUSEKEEPING, self._number, began_s, monotonic()))
             self._usage_timer.reschedule(self._records.usage_due_s + self._session.ping_slack_s)
 
     # Towards the simulation ------------------------------------------------------------------------
 
     def _call(self, name: str, *arguments: Any) -> Any:
         """Call the plug-in; what it raises, or returns against its contract, ends this agent by name."""
-        self._calls[AGENT], self._calls[METHOD] = self._seat, NUMBER_OF[name]
+        self._calls[AGENT], self._calls[METHOD] = self._number, NUMBER_OF[name]
         try:
             return self.half.call(name, *arguments)
         except HalfFailed as failure:

@@ -22,7 +22,7 @@ from madns_runtime.plugin.context import JobContext
 from madns_runtime.plugin.executor import JobRunner, make_executor
 from madns_runtime.plugin.half import HalfFailed, HostHalf, RoleProgram
 from madns_runtime.plugin.host_calls import HostCalls
-from madns_runtime.protocol import events as told
+from madns_runtime.protocol import events
 from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_peers import Address
 from madns_runtime.protocol.messages import ConditionMet, Service
@@ -206,35 +206,35 @@ class HostRuntime:
         else:
             self._port.arm()
 
-    def _handle(self, event: told.HostSessionEvent) -> None:
+    def _handle(self, event: events.HostSessionEvent) -> None:
         match event:
-            case told.AgentDataReceived(agent, ConditionMet(number, t_s)):
+            case events.AgentDataReceived(agent, ConditionMet(number, t_s)):
                 self._conditions.hear(agent, number, t_s)
-            case told.AgentDataReceived(agent, payload, service):
+            case events.AgentDataReceived(agent, payload, service):
                 if self._takes_data:
                     self._guard(self._half.take, agent, payload, service)
-            case told.HostStateEntered(state):
+            case events.HostStateEntered(state):
                 self._announced.state(state)
-            case told.AgentMoved():
+            case events.AgentMoved():
                 self._losses.moved(event)
-            case told.AgentsReady():
+            case events.AgentsReady():
                 self._set_up()
-            case told.AgentsSimulationReady():
+            case events.AgentsSimulationReady():
                 self._start()
-            case told.AgentLost():
+            case events.AgentLost():
                 self._losses.lost(event, may_tell=self._is_set_up)
-            case told.AgentRejoining(agent):
+            case events.AgentRejoining(agent):
                 self._send_setup(agent)
-            case told.AgentRejoined(agent):
+            case events.AgentRejoined(agent):
                 self._losses.rejoined(agent)
                 self._timeline.resume(agent)
-            case told.AgentsComplete():
+            case events.AgentsComplete():
                 self._complete()
-            case told.EmergencyDeclared(who, reason):
+            case events.EmergencyDeclared(who, reason):
                 self._emergency(who, reason)
-            case told.SyncDeadlineBroken(agent, broken):
+            case events.SyncDeadlineBroken(agent, broken):
                 self._journal.event("sync_deadline_broken", agent=agent, late_s=broken.late_s)
-            case told.AgentsStopped(missing):
+            case events.AgentsStopped(missing):
                 self._agents_stopped(missing)
             case _:
                 assert_never(event)

@@ -17,18 +17,18 @@ class LateTicks:
     The account of one agent.
 
     Args:
-        seat: Its number among the agents of its process.
+        number: Its number among the agents of its process.
         period_s: Of its ticks.
         recorder: Where they are recorded.
         account: What its loop did.
     """
 
     def __init__(
-        self, seat: int, period_s: float, *, recorder: Recorder, account: LoopAccount
+        self, number: int, period_s: float, *, recorder: Recorder, account: LoopAccount
     ) -> None:
         self.started_s = 0.0
         """When the agent began to run, s of the local clock."""
-        self._seat = seat
+        self._number = number
         self._period_s = period_s
         self._recorder = recorder
         self._account = account
@@ -46,7 +46,7 @@ class LateTicks:
         """
         index, _, _, lateness_s, missed = timing
         late = LateTick(
-            self._seat,
+            self._number,
             began_s - lateness_s - missed * self._period_s,
             began_s,
             self.started_s,
@@ -73,7 +73,7 @@ class LateTicks:
             return
         index = pacer.next_index
         due_s = now_s - (t_s - pacer.deadline_of(index - new))
-        late = LateTick(self._seat, due_s, now_s, self.started_s, self._period_s, leapt_s)
+        late = LateTick(self._number, due_s, now_s, self.started_s, self._period_s, leapt_s)
         cause = self._account.explain(late)
         self._counts[cause] += new
         self._missed = pacer.missed

@@ -34,7 +34,7 @@ class PackMember(Protocol):
     def tick(self) -> None:
         """Run the tick that is due, if one is."""
 
-    def say_how_it_is(self, now_s: float) -> None:
+    def report_if_due(self, now_s: float) -> None:
         """Ping the host, if that is due by *now_s* of the local clock: this wake-up then serves for both."""
 
 
@@ -103,7 +103,7 @@ class Pack:
             # What a pack says leaves in one packet with its ticks' messages. Of an agent by itself it would hold up the
             # answer to its tick: where answers come, it is said behind them.
             if not self._is_answered:
-                self._say_how_it_is()
+                self._report_if_due()
             self._is_answered = False
         finally:
             if is_shared:
@@ -112,12 +112,12 @@ class Pack:
 
     def _answered(self) -> None:
         self._is_answered = True
-        self._say_how_it_is()
+        self._report_if_due()
 
-    def _say_how_it_is(self) -> None:
+    def _report_if_due(self) -> None:
         now_s = monotonic()
         for member in self._members:
-            member.say_how_it_is(now_s)
+            member.report_if_due(now_s)
 
     def _wait_for_deadline(self) -> None:
         """Wait for what is left until the deadline, WAIT_S_MAX at most, and learn from a wake-up out of sleep."""

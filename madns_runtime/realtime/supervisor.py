@@ -72,7 +72,7 @@ class Supervisor:
 
     Args:
         launch: Which agents, and where the host is.
-        fds: Where the operator's commands come from and events go to; one and the same of who was started by hand.
+        fds: Where the operator's commands come from and events go to; the same one twice for an agent started by hand.
         pending: What had already come behind the launch document.
     """
 

@@ -31,15 +31,15 @@ class TickCalls:
     prepare: Callable[[float], bool] | None
     """Hands in what comes with the tick at a simulated time, s; False if the agent has ended over it. None: nothing ever does."""
     step: Callable[[Tick], None]
-    came_back: Callable[[], None]
-    """Called once it has: ends a process that the step forked, before that does more of its parent's work."""
+    end_if_forked: Callable[[], None]
+    """Called when the step has returned: ends a process that it forked, before that does more of its parent's work."""
     failed: Callable[[BaseException], None]
     """Told what the step raised."""
     ended: Callable[[], None]
     """Told that no tick is left."""
     is_running: Callable[[], bool]
-    say_how_it_is: Callable[[float], None]
-    """Pings the host, if that is due by a local time, s."""
+    report_if_due: Callable[[float], None]
+    """Pings the host, and records what the process uses, where that is due by a local time, s."""
 
 
 class PacedTicks:
@@ -78,16 +78,16 @@ class PacedTicks:
         account = port.process.account
         self.late = LateTicks(seat.number, self.period_s, recorder=recorder, account=account)
         self._late_s = config.deadline.lateness_limit_s
-        self._page, self._seat = seat.calls.page, seat.number
+        self._page, self._number = seat.calls.page, seat.number
         self._port = port
         self._add_span = account.add
         self._record = recorder.record
         self._calls = calls
         # Called every tick: without a layer between.
         self._prepare, self._step, self._is_running = calls.prepare, calls.step, calls.is_running
-        self._came_back = calls.came_back
+        self._end_if_forked = calls.end_if_forked
         self._faults = StepFaults()
-        self.say_how_it_is = calls.say_how_it_is
+        self.report_if_due = calls.report_if_due
         self._look = port.conditions.look if port.conditions.must_look else None
         self._ahead_s = 0.0
         """Simulated time minus the local clock, as the newest tick began, s."""
@@ -102,7 +102,7 @@ class PacedTicks:
             self._calls.ended()
 
     def end_at(self, t_s: float) -> None:
-        """Take simulated time *t_s* for the run's end, if it is none later, s."""
+        """Let the run end at simulated time *t_s*, s, where that is before its present end."""
         if t_s < self.duration_s:
             self.duration_s = t_s
             self.pacer.end_by(t_s)
@@ -110,7 +110,7 @@ class PacedTicks:
                 self._calls.ended()
 
     def over_s(self) -> float:
-        """Return the simulated time at which the run is over and the last tick due, s: its phase may take that behind the end."""
+        """Return the later of the run's end and the last tick's deadline, which its phase may put behind the end, s."""
         return max(self.duration_s, self.pacer.deadline_of(self.pacer.tick_count - 1))
 
     def finish(self, now_s: float) -> None:
@@ -149,7 +149,7 @@ class PacedTicks:
         sleep(min((monotonic() - began_s) * (faults.factor - 1.0), SLOWED_S_MAX))
 
     def next_deadline_s(self) -> float:
-        """Return the simulated time at which the next one is due, s; infinite while there is none."""
+        """Return the simulated time at which the next tick is due, s; infinite while there is none."""
         deadline_s = self.pacer.next_deadline_s() if self._is_running() else None
         return math.inf if deadline_s is None else deadline_s
 
@@ -158,7 +158,7 @@ class PacedTicks:
         return self._port.local_s(t_s)
 
     def tick(self) -> None:
-        """Run the one that is due, if one is."""
+        """Run the tick that is due, if one is."""
         if not self._is_running():
             return
         pacer, port = self.pacer, self._port
@@ -175,15 +175,15 @@ class PacedTicks:
             page[T_S] = t_s
             if self._prepare is not None and not self._prepare(t_s):
                 return
-            page[AGENT], page[METHOD] = self._seat, STEP
+            page[AGENT], page[METHOD] = self._number, STEP
             try:
                 self._step(Tick(index, t_s, self.period_s, lateness_s, missed, deadline_s))
             except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything
-                self._came_back()
+                self._end_if_forked()
                 page[METHOD] = IDLE
                 self._calls.failed(error)
                 return
-            self._came_back()
+            self._end_if_forked()
             page[METHOD] = IDLE
             if self._look is not None:
                 self._look(t_s)
@@ -195,7 +195,7 @@ class PacedTicks:
             values: tuple[Any, ...] = (index, int(lateness_s * 1e6), int(margin_s * 1e6), missed)
             self._record("ticks", values)
             # Before the account of a late tick, which is a span of its own: spans end one after the other.
-            self._add_span(Span(Cause.STEP, self._seat, local_s, ended_s))
+            self._add_span(Span(Cause.STEP, self._number, local_s, ended_s))
             if missed or lateness_s > self._late_s:
                 self.late.explain(timing, local_s, began_s - local_s - ahead_s)
         if pacer.is_over:

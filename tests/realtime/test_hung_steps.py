@@ -38,11 +38,11 @@ def test_what_a_hung_agent_sends_on_a_message_of_the_host_bears_the_newest_tick(
     calls: Any = TickCalls(
         prepare=prepare,
         step=lambda tick: stepped.append(tick.t_s),
-        came_back=lambda: None,
+        end_if_forked=lambda: None,
         failed=lambda error: None,
         ended=lambda: None,
         is_running=lambda: True,
-        say_how_it_is=lambda now_s: None,
+        report_if_due=lambda now_s: None,
     )
     seat: Any = SimpleNamespace(calls=SimpleNamespace(page=[0.0] * 8), number=0)
     recorder: Any = SimpleNamespace(record=lambda stream, values: None)

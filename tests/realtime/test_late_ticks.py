@@ -73,11 +73,11 @@ class Loop:
         calls = TickCalls(
             prepare=None,
             step=self._step,
-            came_back=lambda: None,
+            end_if_forked=lambda: None,
             failed=lambda error: pytest.fail(str(error)),
             ended=lambda: None,
             is_running=lambda: True,
-            say_how_it_is=lambda now_s: None,
+            report_if_due=lambda now_s: None,
         )
         loop_seat = SimpleNamespace(calls=SimpleNamespace(page=[0.0] * 8), number=seat)
         recorder = SimpleNamespace(

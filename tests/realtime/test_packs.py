@@ -67,7 +67,7 @@ class Member:
         self.ticks += 1
         self.due_s += 0.5
 
-    def say_how_it_is(self, now_s):
+    def report_if_due(self, now_s):
         self.pings += 1
 
 
