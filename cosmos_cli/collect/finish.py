@@ -76,7 +76,7 @@ class RunSummary:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """One line a source whose data are not all there."""
+        """One line per source whose data are not all there."""
         return tuple(self.document["data"]["missing"])
 
     @property

@@ -94,7 +94,7 @@ def find_missing(
     of_devices: Mapping[str, Sequence[str]] = NO_FILES,
 ) -> list[str]:
     """
-    Return one line a source whose data are not all there, each starting with its name.
+    Return one line per source whose data are not all there, each starting with its name.
 
     Args:
         expected: Who should have recorded what.

@@ -17,9 +17,13 @@ from cosmos_cli.ui.plural import counted
 from madns_runtime.conditions.reports import BROKEN
 from madns_runtime.plain_values import first_few, mapping_at
 
-OF_TICKS = "deadline."
-"""Begins the names of the checks that late and missed ticks break."""
+TICK_CHECKS = "deadline."
+"""Beginning of the names of the checks that late and missed ticks break."""
+UNJUDGED_IN_LOCKSTEP = (
+    "time.rtf, deadline.miss_ratio, deadline.overrun_ratio: not judged: in lockstep time waits"
+)
 TICKS_OF_A_RATE = 2
+"""A real-time factor needs so many ticks at least."""
 WAKE_UP_LATE_S = 0.02
 """A single wake-up may be late by this much on an idle machine; lateness has checks of its own."""
 
@@ -33,8 +37,8 @@ class CheckResult:
     got: float | None
     passed: bool
     worst: str | None = None
-    """Source of the worst value, where there are many: an agent, the host, a stream. Of the framework's checks `got` is of
-    all of them together, of others it is this one's."""
+    """Source of the worst value, where there are many: an agent, the host, a stream. In the framework's checks `got` is the
+    value of all of them together, in others that of this source."""
     agent: str | None = None
     """Of an expectation: the agent of this value, or host."""
     t_s: float | None = None
@@ -106,12 +110,12 @@ class RunFacts:
     problems: tuple[str, ...] = ()
     """Further problems, such as a process that had to be killed."""
     missing: tuple[str, ...] = ()
-    """One line a source whose data are missing, cut or dropped, each starting with its name."""
+    """One line per source whose data are missing, cut or dropped, each starting with its name."""
     miss_ratio: float | None = None
     overrun_ratio: float | None = None
     rtf: float | None = None
     no_rate: str = ""
-    """Why there is no real-time factor to be told; empty if there is one to be."""
+    """Why the run has no real-time factor; empty where it has one, or should."""
     is_lockstep: bool = False
     """Whether simulated time waited for everybody: nothing can be late then, whatever the clock shows."""
     reliable_lost: int | None = None
@@ -154,7 +158,7 @@ class Verdict:
 
 def judge(facts: RunFacts, limits: CheckLimits) -> Verdict:
     """
-    Judge a run; 0 only when there is nothing to say.
+    Judge a run; its exit code is 0 only where nothing is wrong.
 
     Of several faults the first decides: interrupted 130, ended by a lost machine 3, failed 1, a machine
     failed 3, data incomplete 5, a check broken 4, not clean 3.
@@ -180,14 +184,9 @@ def judge(facts: RunFacts, limits: CheckLimits) -> Verdict:
     )
 
 
-LOCKSTEP = (
-    "time.rtf, deadline.miss_ratio, deadline.overrun_ratio: not judged: in lockstep time waits"
-)
-
-
 def _unjudged(facts: RunFacts) -> tuple[str, ...]:
     if facts.is_lockstep:
-        return (LOCKSTEP,)
+        return (UNJUDGED_IN_LOCKSTEP,)
     return () if _is_rate_judged(facts) else (f"time.rtf: not judged: {facts.no_rate}",)
 
 
@@ -296,10 +295,8 @@ def _conclude(
     if status == "interrupted":
         if facts.host_status in ("failed", "aborted"):  # it was ending already, and had a cause
             return ExitCode.INTERRUPTED, f"INTERRUPTED by the operator, after {blame}"
-        if facts.who not in (
-            None,
-            "operator",
-        ):  # as by `cosmos down`, when there was no operator to ask
+        if facts.who not in (None, "operator"):
+            # As by `cosmos down`, when there was no operator to ask.
             return ExitCode.INTERRUPTED, f"INTERRUPTED: {blame}"
         return ExitCode.INTERRUPTED, f"INTERRUPTED by {facts.who or 'the operator'}"
     if status not in ("complete", BROKEN):
@@ -318,7 +315,7 @@ def _conclude(
         text = f"CHECK BROKEN: {_listed([_told(c) for c in broken])}"
         if facts.lost_agents:
             text += f"; lost: {_listed([_lost(facts, name) for name in facts.lost_agents])}"
-        is_of_ticks = any(check.name.startswith(OF_TICKS) for check in broken)
+        is_of_ticks = any(check.name.startswith(TICK_CHECKS) for check in broken)
         hint = (
             f"; ticks late or missed: {facts.late_hint}" if is_of_ticks and facts.late_hint else ""
         )

@@ -15,16 +15,16 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.target import Target
 
 OUTPUT_BYTES_MAX = 4 * 1024 * 1024
-"""Bytes that `Connection.run` keeps of each output: one half of its begin, one of its end."""
+"""Bytes that `Connection.run` keeps of each output: one half from its beginning, one from its end."""
 LEFT_OPEN_S = 1.0
 """Silence after a command's end for which its output is still waited for: what it left running may hold that for ever."""
 SAID_BYTES_MAX = 1024 * 1024 * 1024
 """Bytes that a command may write at all before it is ended."""
 EXIT_STATUS_TIMEOUT_S = 20.0
-"""Wait for a program's exit status, once its output has ended: it closes that first, and may have to wait for a
+"""Wait for a program's exit status, once its output has ended: a program closes that first, and may have to wait for a
 processor before it has ended itself."""
 SMALL_BYTES_MAX = 1024 * 1024
-"""Bytes for a command that has next to nothing to say; a start-up file there may talk."""
+"""Bytes for a command that prints next to nothing; the shell's start-up files may print something as well."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +36,7 @@ class ConnectOptions:
     accept_new_host_keys: bool = False
     """Whether unknown host keys are recorded; changed ones are refused whatever stands here."""
     listed: Mapping[str, Target] = field(default_factory=dict)
-    """By name, where an inventory has machines by now: asked for one that is not reached where a run's plan has it."""
+    """Machines where the inventory has them now, by name: tried for one that is not reached where a run's plan has it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,10 +145,10 @@ class Connection(Protocol):
 
         Args:
             command: For the user's shell there.
-            stdin: What it reads; None for nothing, and no end either before the connection closes, for
-                which `cosmos_cli.fleet.shell` waits.
+            stdin: What it reads; None for an input without content that ends only with the connection:
+                `cosmos_cli.fleet.shell` waits for that end.
             timeout_s: Until it has ended.
-            said_bytes_max: What it may say; who says more is ended.
+            said_bytes_max: Bytes that it may write; a command that writes more is ended.
 
         Raises:
             MachineFailure: TIMEOUT, or DATA: it said too much; or the connection is lost.

@@ -51,7 +51,7 @@ def raise_if_failed(outcomes: Sequence[Outcome[T]], what: str) -> None:
     Raise when any machine failed, naming each and why.
 
     Raises:
-        MachinesError: Its text has a line a failed machine.
+        MachinesError: Its text has one line per failed machine.
     """
     bad = failed(outcomes)
     if bad:

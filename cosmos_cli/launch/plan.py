@@ -24,6 +24,7 @@ from cosmos_cli.models.limit import PatternError, matching_machines
 from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.scenario import Scenario
 from madns_runtime.lockstep.partition import share_out
+from madns_runtime.plain_values import first_few
 
 NAMES_SHOWN_MAX = 8
 LOCKSTEP_IS_HERE = (
@@ -90,7 +91,7 @@ class LaunchPlan:
 
     @property
     def elsewhere(self) -> tuple[Machine, ...]:
-        """Those of them that are other computers."""
+        """The machines involved that are other computers."""
         return tuple(each for each in self.involved.values() if each.connection != "local")
 
     def to_mapping(self) -> dict[str, Any]:
@@ -237,7 +238,7 @@ class _Dealer:
         return [place for place in self.places if place.machine is not self.host] or self.places
 
     def _without_machines(self) -> list[str]:
-        """Return the names of the inventory that mean nobody here: empty groups, and what --limit leaves out."""
+        """Return the names of the inventory that no machine here has: empty groups, and what --limit leaves out."""
         machines = [place.machine for place in self.places]
         known = frozenset[str]().union(*(machine.inventory_names for machine in machines))
         return sorted(known - {machine.name for machine in machines})
@@ -343,10 +344,7 @@ def _machine_mapping(machine: Machine) -> dict[str, Any]:
 
 
 def _some(places: Sequence[_Place]) -> str:
-    names = [place.machine.name for place in places]
-    if len(names) <= NAMES_SHOWN_MAX:
-        return ", ".join(names)
-    return f"{', '.join(names[:NAMES_SHOWN_MAX])}, ... ({len(names)})"
+    return first_few([place.machine.name for place in places], NAMES_SHOWN_MAX)
 
 
 def _processes(

@@ -1,10 +1,9 @@
 """
 The supervision of a run, as one pure object: it takes events and the time, and returns actions.
 
-It starts the host, then one supervisor per machine, passes on whose process died, gives a machine that returns its
-agents again, and is over only when no process of the run lives: first they are asked to stop, then ended by force
-(`Children`). Every wait is a moment on its agenda. No clock, socket or process here: the operator's loop carries out
-what it returns.
+It starts the host, then one supervisor per machine, tells the host which processes died, and gives a machine that
+returns its agents again. It is over when no process of the run lives: all are asked to stop, then ended by force
+(`Children`). Every wait is a moment on its agenda. No clock, socket or process here: the operator's loop acts.
 """
 
 from __future__ import annotations
@@ -126,7 +125,7 @@ class Supervision:
     @property
     def is_over(self) -> bool:
         """Whether nothing of the run lives, or it goes on by itself."""
-        is_at_rest = not len(self._manual) and not self._watch.is_trying
+        is_at_rest = not self._manual and not self._watch.is_trying
         return self.is_detached or (is_at_rest and not self._children.living)
 
     def has_ended(self, name: str) -> bool:
@@ -142,7 +141,7 @@ class Supervision:
     # Starting -------------------------------------------------------------------------------------
 
     def _begin(self, event: happened.Begun) -> None:
-        self._watch.check_later(self._check_pulses)
+        self._watch.check_later(self._check_signs_of_life)
         self._agenda.do(actions.StartHost())
 
     def _child_started(self, event: happened.ChildStarted) -> None:
@@ -210,8 +209,8 @@ class Supervision:
             self._host_finished(event.result)
 
     def _host_finished(self, result: Mapping[str, Any] | None) -> None:
-        told = self.host_result or {}  # by a copy of the host that its plug-in forked
-        self.host_result = told if told.get("status") == "failed" else result
+        earlier = self.host_result or {}  # from a copy of the host that its plug-in forked
+        self.host_result = earlier if earlier.get("status") == "failed" else result
         self._has_host_finished = True
         self._close_down(grace_s=STOP_GRACE_S)
 
@@ -275,7 +274,7 @@ class Supervision:
             self._agents_lost(left, f"its supervisor {how}")
         if self._is_wanted(machine):
             self._watch.revive(machine)
-        if all(child.has_exited for child in self._children.supervisors) and not len(self._manual):
+        if all(child.has_exited for child in self._children.supervisors) and not self._manual:
             self._limits.alone()
 
     def _agents_lost(self, agents: tuple[str, ...], how: str) -> None:
@@ -291,8 +290,8 @@ class Supervision:
 
     # Machines -------------------------------------------------------------------------------------
 
-    def _check_pulses(self) -> None:
-        self._watch.check_later(self._check_pulses)
+    def _check_signs_of_life(self) -> None:
+        self._watch.check_later(self._check_signs_of_life)
         for machine, child in self._watch.check():
             if child is None:
                 self._machine_lost(machine, f"no sign of life for {SILENCE_S:g} s")
