@@ -165,19 +165,19 @@ class LogFollower:
     ) -> None:
         with (
             contextlib.closing(connect(source.target, self.options)) as connection,
-            Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as board,
+            Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as helper,
         ):
             is_more = True
             while not self._stop.is_set() and is_more:
-                told = self._asked(board, source, offsets)
+                told = self._asked(helper, source, offsets)
                 is_living = is_following and bool(told["living"])
                 self._answers.put(_Answered(source.machine, told={**told, "living": is_living}))
                 is_more = is_living or bool(told["more"])
                 if not told["more"]:
                     self._stop.wait(ASK_INTERVAL_S if is_more else 0)
 
-    def _asked(self, board: Helper, source: RecordingMachine, offsets: dict[str, int]) -> Told:
-        told: Told = board.call(
+    def _asked(self, helper: Helper, source: RecordingMachine, offsets: dict[str, int]) -> Told:
+        told: Told = helper.call(
             "tail", {**source.where, "offsets": offsets}, timeout_s=ANSWER_TIMEOUT_S
         ).value
         offsets |= {path: int(file["end"]) for path, file in told["files"].items()}

@@ -153,7 +153,7 @@ class MachineRetrieval:
         self._bytes_max = bytes_max
         self._incoming = PartialFiles(run, source.machine)
 
-    def go_on(self, board: Helper) -> Retrieved:
+    def go_on(self, helper: Helper) -> Retrieved:
         """
         Fetch what is not here yet, and have all of it released there.
 
@@ -163,7 +163,7 @@ class MachineRetrieval:
         reason = ""
         for _ in range(ROUNDS_MAX):
             try:
-                return self._round(board)
+                return self._round(helper)
             except Changed as error:
                 reason = str(error)
         raise MachineFailure(
@@ -172,20 +172,20 @@ class MachineRetrieval:
             "see what writes there",
         )
 
-    def _round(self, board: Helper) -> Retrieved:
-        sizes = self._ask_sizes(board)
+    def _round(self, helper: Helper) -> Retrieved:
+        sizes = self._ask_sizes(helper)
         if sizes is None:
             return self._gone()
         # Before a byte is read there: a file may say to be larger than any disk.
         check_sizes(sizes, self._bytes_max, self._source.directory)
         self._incoming.check_room_for(sizes)
-        listed = self._list(board, sizes)
+        listed = self._list(helper, sizes)
         if listed is None:
             return self._gone()
         entries, manifest_sha256 = listed
         offer = check_offer(entries, self._source.machine, self._owner_of)
         transfers = self._open(offer)
-        faults = [*offer.faults, *self._fetch(board, transfers)]
+        faults = [*offer.faults, *self._fetch(helper, transfers)]
         if faults:
             raise self._refusal(faults)
         came = {transfer.file for transfer in transfers}
@@ -200,14 +200,14 @@ class MachineRetrieval:
         )
         write_note(self._run, self._source.machine, note)
         self._incoming.tidy()
-        return self._release(board, note)
+        return self._release(helper, note)
 
-    def _ask_sizes(self, board: Helper) -> list[SizedFile] | None:
+    def _ask_sizes(self, helper: Helper) -> list[SizedFile] | None:
         """Return what there is and how large; None when there is no such directory."""
         sizes: list[SizedFile] = []
         arguments = {**self._source.where, "patience_s": PATIENCE_S}
         timeout_s = PATIENCE_S + PIECE_TIMEOUT_S
-        for answer in board.parts(
+        for answer in helper.parts(
             "sizes", arguments, timeout_s=timeout_s, whole_s=PATIENCE_S + SIZES_TIMEOUT_S
         ):
             if answer.value.get("gone") is True:
@@ -219,7 +219,7 @@ class MachineRetrieval:
         return sizes
 
     def _list(
-        self, board: Helper, sizes: Sequence[SizedFile]
+        self, helper: Helper, sizes: Sequence[SizedFile]
     ) -> tuple[list[Mapping[str, Any]], str] | None:
         """Return the machine's manifest and its hash; None when there is no such directory."""
         entries: list[Mapping[str, Any]] = []
@@ -229,7 +229,7 @@ class MachineRetrieval:
             "patience_s": PATIENCE_S,
             "bytes_max": self._bytes_max,
         }
-        for answer in self._hashed(board, arguments, sizes):
+        for answer in self._hashed(helper, arguments, sizes):
             value = answer.value if isinstance(answer.value, Mapping) else {}
             is_gone = is_gone or value.get("gone") is True
             name = value.get("sha256", name)
@@ -245,13 +245,13 @@ class MachineRetrieval:
         return entries, name
 
     def _hashed(
-        self, board: Helper, arguments: Mapping[str, Any], sizes: Sequence[SizedFile]
+        self, helper: Helper, arguments: Mapping[str, Any], sizes: Sequence[SizedFile]
     ) -> Iterator[Answer]:
         """Have all files read and hashed there, in the time that so much may take."""
         total = sum(file.size_bytes for file in sizes)
         whole_s, timeout_s = hash_deadline_s(len(sizes), total), PATIENCE_S + PIECE_TIMEOUT_S
         try:
-            yield from board.parts("manifest", arguments, timeout_s=timeout_s, whole_s=whole_s)
+            yield from helper.parts("manifest", arguments, timeout_s=timeout_s, whole_s=whole_s)
         except MachineFailure as failure:
             if failure.kind is not FailureKind.TIMEOUT:
                 raise
@@ -285,14 +285,14 @@ class MachineRetrieval:
             transfers.append(transfer)
         return transfers
 
-    def _fetch(self, board: Helper, transfers: Sequence[Transfer]) -> list[str]:
+    def _fetch(self, helper: Helper, transfers: Sequence[Transfer]) -> list[str]:
         """Get what is missing of these files and put each in its place; return what kept any from it."""
         self._incoming.check_room(transfers)
         wanted = [transfer for transfer in transfers if not transfer.is_all_there]
         errors: dict[str, str] = {}
         try:
             if wanted:
-                self._receive(board, wanted, errors)
+                self._receive(helper, wanted, errors)
         except MachineFailure:
             # What is whole stays and is judged, although the rest did not come.
             with contextlib.suppress(MachineFailure):
@@ -306,11 +306,11 @@ class MachineRetrieval:
                 raise Changed(f"{path}: {what}")
         return faults
 
-    def _receive(self, board: Helper, wanted: Sequence[Transfer], errors: dict[str, str]) -> None:
+    def _receive(self, helper: Helper, wanted: Sequence[Transfer], errors: dict[str, str]) -> None:
         files = [[each.file.path, each.offset, each.file.size_bytes] for each in wanted]
         arguments = {**self._source.where, "files": files}
         with PartWriter(wanted, self._run.path) as writer:
-            for answer in board.parts(
+            for answer in helper.parts(
                 "fetch", arguments, timeout_s=PIECE_TIMEOUT_S, whole_s=STANDSTILL_S
             ):
                 value = answer.value if isinstance(answer.value, Mapping) else {}
@@ -346,10 +346,10 @@ class MachineRetrieval:
             )
         return self._released(note)
 
-    def _release(self, board: Helper, note: Note) -> Retrieved:
+    def _release(self, helper: Helper, note: Note) -> Retrieved:
         arguments = {**self._source.where, "manifest_sha256": note.manifest_sha256}
         try:
-            board.call("release", arguments, timeout_s=RELEASE_TIMEOUT_S)
+            helper.call("release", arguments, timeout_s=RELEASE_TIMEOUT_S)
         except MachineFailure as failure:
             if failure.kind is FailureKind.DATA:
                 raise Changed(failure.text) from failure

@@ -193,7 +193,7 @@ class Retrieval:
 
     def _ask_living(self, source: RecordingMachine) -> list[str]:
         return [
-            str(words) for words in self._visit(source).board.call("living", source.where).value
+            str(words) for words in self._visit(source).helper.call("living", source.where).value
         ]
 
     def _attempt(self, source: RecordingMachine, account: TransferAccount) -> Retrieved:
@@ -204,7 +204,7 @@ class Retrieval:
             account=account,
             bytes_max=self._bound_of(source),
         )
-        return retrieval.go_on(self._visit(source).board)
+        return retrieval.go_on(self._visit(source).helper)
 
     def _bound_of(self, source: RecordingMachine) -> int:
         if self._bytes_max is not None:
@@ -225,12 +225,12 @@ class Retrieval:
             connection = given if is_given and given else self._open(source)
             watch = SilenceWatch(connection, lambda s: self._name_silent(source, s))
             try:
-                board = Helper.start(connection, PARTS, watch=watch)
+                helper = Helper.start(connection, PARTS, watch=watch)
             except MachineFailure:
                 if not is_given:
                     connection.close()
                 raise
-            visit = _Visit(connection, board, is_given=is_given)
+            visit = _Visit(connection, helper, is_given=is_given)
             self._visits[source.machine] = visit
         return visit
 
@@ -259,15 +259,15 @@ def _is_worth_another(failure: MachineFailure, barren: int) -> bool:
 class _Visit:
     """A connection and what works at its other end."""
 
-    def __init__(self, connection: Connection, board: Helper, *, is_given: bool) -> None:
-        self.board = board
+    def __init__(self, connection: Connection, helper: Helper, *, is_given: bool) -> None:
+        self.helper = helper
         self._connection = connection
         self._is_given = is_given
 
     def close(self, *, at_once: bool = False) -> None:
         """End it; *at_once* while a thread may still use it: the connection alone, which ends the rest."""
         if not at_once:
-            self.board.close()
+            self.helper.close()
         if not self._is_given:
             self._connection.close()
 

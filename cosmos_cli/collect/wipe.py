@@ -151,14 +151,14 @@ def look(connection: Connection, known: Mapping[str, RunDirectory], *, is_all: b
     """
     target = connection.target
     layout = Layout(target.root)
-    with Helper.start(connection, PARTS) as board:
+    with Helper.start(connection, PARTS) as helper:
         where = {"runs": layout.runs, "state": layout.state}
-        listed = board.call("inventory_runs", where, timeout_s=ASK_TIMEOUT_S).value
-        runs = tuple(_run_there(board, target, entry, known) for entry in listed)
+        listed = helper.call("inventory_runs", where, timeout_s=ASK_TIMEOUT_S).value
+        runs = tuple(_run_there(helper, target, entry, known) for entry in listed)
         if not is_all:
             return Findings(runs=runs)
         root = {"root": layout.root, "state": layout.state}
-        content = board.call("root_content", root, timeout_s=ASK_TIMEOUT_S).value
+        content = helper.call("root_content", root, timeout_s=ASK_TIMEOUT_S).value
     return Findings(
         runs=runs,
         installed_bytes=content["bytes"],
@@ -182,14 +182,14 @@ def carry_out(connection: Connection, order: Order, holder: str) -> Wiped:
     """
     target = connection.target
     layout = Layout(target.root)
-    with Helper.start(connection, PARTS) as board:
-        board.call("lock", {"path": layout.lock, "holder": holder})
+    with Helper.start(connection, PARTS) as helper:
+        helper.call("lock", {"path": layout.lock, "holder": holder})
         for run in order.runs:
-            _delete(board, target, run)
+            _delete(helper, target, run)
         left: tuple[str, ...] = ()
         if order.is_root:
             root = {"root": layout.root, "state": layout.state}
-            left = tuple(board.call("remove_root", root, timeout_s=DELETE_TIMEOUT_S).value)
+            left = tuple(helper.call("remove_root", root, timeout_s=DELETE_TIMEOUT_S).value)
     return Wiped(
         runs=tuple(run.name for run in order.runs),
         bytes=order.bytes,
@@ -210,7 +210,7 @@ def runs_here(root: Path) -> dict[str, RunDirectory]:
 
 
 def _run_there(
-    board: Helper, target: Target, entry: Mapping[str, Any], known: Mapping[str, RunDirectory]
+    helper: Helper, target: Target, entry: Mapping[str, Any], known: Mapping[str, RunDirectory]
 ) -> RunThere:
     name = str(entry["name"])
     run = known.get(name)
@@ -219,7 +219,7 @@ def _run_there(
         state = "running"
     elif name.startswith(RELEASED_PREFIX):
         state = "left over"
-    elif run is not None and _is_here(board, target, name, run):
+    elif run is not None and _is_here(helper, target, name, run):
         state = "collected"
     return RunThere(
         name=name,
@@ -232,49 +232,49 @@ def _run_there(
     )
 
 
-def _is_here(board: Helper, target: Target, name: str, run: RunDirectory) -> bool:
+def _is_here(helper: Helper, target: Target, name: str, run: RunDirectory) -> bool:
     """Tell whether all that a machine has of a run is, unchanged, what was verified here and is here still."""
     note = read_note(run, target.name)
-    is_known = note is not None and note.manifest_sha256 == _listed(board, target, name, note)
+    is_known = note is not None and note.manifest_sha256 == _listed(helper, target, name, note)
     return is_known and is_all_here(run, target.name)
 
 
-def _listed(board: Helper, target: Target, name: str, note: Note) -> str | None:
+def _listed(helper: Helper, target: Target, name: str, note: Note) -> str | None:
     """Have a run's directory listed there, and return the hash of its manifest; None if it holds more than was noted."""
     try:
-        return _manifest_sha256(board, _where(target, name), note)
+        return _manifest_sha256(helper, _where(target, name), note)
     except MachineFailure as failure:
         if failure.kind is FailureKind.DATA:
             return None
         raise
 
 
-def _manifest_sha256(board: Helper, where: Mapping[str, str], note: Note) -> str | None:
+def _manifest_sha256(helper: Helper, where: Mapping[str, str], note: Note) -> str | None:
     digest, told = hashlib.sha256(), None
     arguments = {**where, "bytes_max": note.bytes}
     whole_s = hash_deadline_s(note.files, note.bytes)
-    for answer in board.parts("manifest", arguments, timeout_s=PIECE_TIMEOUT_S, whole_s=whole_s):
+    for answer in helper.parts("manifest", arguments, timeout_s=PIECE_TIMEOUT_S, whole_s=whole_s):
         for entry in answer.value.get("files", ()):
             digest.update(entry_line(entry))
         told = answer.value.get("sha256", told)
     return told if told == digest.hexdigest() else None
 
 
-def _delete(board: Helper, target: Target, run: RunThere) -> None:
+def _delete(helper: Helper, target: Target, run: RunThere) -> None:
     where = _where(target, run.name)
     if run.state != "collected":
         shown = {"bytes": run.bytes, "files": run.files, "newest_s": run.newest_s}
-        board.call("discard", {**where, "shown": shown}, timeout_s=DELETE_TIMEOUT_S)
+        helper.call("discard", {**where, "shown": shown}, timeout_s=DELETE_TIMEOUT_S)
         return
     here = RunDirectory(Path(str(run.here)))
-    if not _is_here(board, target, run.name, here):
+    if not _is_here(helper, target, run.name, here):
         raise MachineFailure(
             FailureKind.DATA, f"{run.name} is not what was collected any more", "repeat the command"
         )
     note = read_note(here, target.name)
     assert note is not None, "_is_here read it"
     copy = {**where, "manifest_sha256": note.manifest_sha256}
-    board.call("release", copy, timeout_s=DELETE_TIMEOUT_S)
+    helper.call("release", copy, timeout_s=DELETE_TIMEOUT_S)
     write_note(here, target.name, note.in_state("released"))
 
 

@@ -80,9 +80,9 @@ def facts(
 
 def _ask(connection: Connection) -> MachineFacts:
     arguments = {"root": connection.target.root, "sudo": connection.target.may_become_root}
-    with Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as board:
+    with Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as helper:
         asked = datetime.now(UTC)
-        told = board.call("facts", arguments, timeout_s=TIMEOUT_S).value
+        told = helper.call("facts", arguments, timeout_s=TIMEOUT_S).value
         return MachineFacts.from_mapping(
             told,
             asked_utc_s=asked.timestamp(),
@@ -91,14 +91,14 @@ def _ask(connection: Connection) -> MachineFacts:
 
 
 def _row(machine: str, told: MachineFacts) -> tuple[str, ...]:
-    board, memory_bytes = told.board, told.memory_total_bytes
+    computer, memory_bytes = told.board, told.memory_total_bytes
     return (
         machine,
-        board.model or "",
-        board.machine if board.bits == 64 else f"{board.machine} ({board.bits} bit)",
-        board.os_name,
+        computer.model or "",
+        computer.machine if computer.bits == 64 else f"{computer.machine} ({computer.bits} bit)",
+        computer.os_name,
         ".".join(map(str, told.python.version)),
-        "" if board.processors is None else str(board.processors),
+        "" if computer.processors is None else str(computer.processors),
         "" if memory_bytes is None else f"{memory_bytes / GIB:.1f}",
         f"{told.disk.free_bytes / GIB:.1f} of {told.disk.total_bytes / GIB:.1f}",
         f"{told.clock_offset_s:+.3f}",

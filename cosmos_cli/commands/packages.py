@@ -151,10 +151,10 @@ def _change_one(connection: Connection, arguments: dict[str, Any]) -> Changed:
     if not is_check:
         require_root(target, "leave that machine out with --limit")
     last: Changed = {}
-    with Helper.start(connection, PARTS) as board:
+    with Helper.start(connection, PARTS) as helper:
         if not is_check:
-            board.call("lock", {"path": Layout(target.root).lock, "holder": "cosmos packages"})
-        for part in board.parts(
+            helper.call("lock", {"path": Layout(target.root).lock, "holder": "cosmos packages"})
+        for part in helper.parts(
             "packages",
             arguments,
             as_root=not is_check,

@@ -120,8 +120,8 @@ def _look_at_devices(
 def _bring(connection: Connection, fleet_up: BackgroundCall[FleetUp]) -> MachineResult | None:
     if connection.target.connection == "local":
         return None
-    with Helper.start(connection, HELPER_PARTS, watch=SilenceWatch(connection)) as board:
-        return fleet_up.result().bring(connection, board)
+    with Helper.start(connection, HELPER_PARTS, watch=SilenceWatch(connection)) as helper:
+        return fleet_up.result().bring(connection, helper)
 
 
 def _show(

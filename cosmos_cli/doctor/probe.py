@@ -130,7 +130,7 @@ def ask(
     return _call(
         connection,
         arguments,
-        lambda board: needs.ask(board, machine) if needs and machine else [],
+        lambda helper: needs.ask(helper, machine) if needs and machine else [],
     )
 
 
@@ -172,12 +172,12 @@ def _wake_ups(wants: Wants, priority: int) -> dict[str, Any]:
 def _call(
     connection: Connection,
     arguments: Mapping[str, Any],
-    ask_devices: Callable[[Helper], Any] = lambda board: (),
+    ask_devices: Callable[[Helper], Any] = lambda helper: (),
 ) -> dict[str, Any]:
-    with Helper.start(connection, PARTS) as board:
+    with Helper.start(connection, PARTS) as helper:
         asked_s = time.clock_gettime(time.CLOCK_REALTIME)
-        told = dict(board.call("doctor", arguments, timeout_s=TIMEOUT_S).value)
-        told["devices"] = ask_devices(board)
+        told = dict(helper.call("doctor", arguments, timeout_s=TIMEOUT_S).value)
+        told["devices"] = ask_devices(helper)
     told["asked_utc_s"] = asked_s
     return told
 
@@ -196,7 +196,7 @@ class DoctorNeeds:
         requirements = scenario_file.scenario.requirements if scenario_file else ()
         self._requirements = tuple(text for text in requirements if not is_own_requirement(text))
 
-    def ask(self, board: Helper, machine: Machine) -> list[dict[str, Any]]:
+    def ask(self, helper: Helper, machine: Machine) -> list[dict[str, Any]]:
         """
         Return what is missing on a machine, by device.
 
@@ -209,21 +209,21 @@ class DoctorNeeds:
         asked = need_questions(
             machine.name,
             needs,
-            greeting=board.greeting,
-            environments=tuple(self._environments(board, machine, needs)),
+            greeting=helper.greeting,
+            environments=tuple(self._environments(helper, machine, needs)),
         )
         conditions = conditions_of(asked)
-        told = board.call("look", {"conditions": conditions}, timeout_s=TIMEOUT_S).value
+        told = helper.call("look", {"conditions": conditions}, timeout_s=TIMEOUT_S).value
         return missing_of(machine.name, needs, asked, told["conditions"])
 
-    def _environments(self, board: Helper, machine: Machine, needs: MachineNeeds) -> Iterator[str]:
+    def _environments(self, helper: Helper, machine: Machine, needs: MachineNeeds) -> Iterator[str]:
         """Yield the folders of environments that `cosmos up` would have made for these needs."""
-        layout = Layout(at_home(machine.variables.root, str(board.greeting["home"])))
+        layout = Layout(at_home(machine.variables.root, str(helper.greeting["home"])))
         for requirements in {(), self._requirements}:
             for is_host in (False, True):
                 key = remembered_key(
                     EnvironmentNeed.of_machine(
-                        board.greeting,
+                        helper.greeting,
                         machine.variables,
                         requirements,
                         is_host=is_host,

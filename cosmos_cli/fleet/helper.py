@@ -141,19 +141,19 @@ class Helper:
             with _PACKAGE_LOCK:  # made once, not by every thread that begins at the same moment
                 package = _package(tuple(parts))
             python = connection.target.python
-            board = cls(connection.open(start_command(python, len(package))), watch)
-            board.machine = connection.target.name
+            helper = cls(connection.open(start_command(python, len(package))), watch)
+            helper.machine = connection.target.name
             try:
-                board._greet(package, timeout_s)
+                helper._greet(package, timeout_s)
             except MachineFailure as failure:
                 if failure.kind is FailureKind.DATA:
-                    board._read_to_its_end()
-                explained = board._explain(failure, python)
-                board.close()  # of a channel that is closed nobody learns how it ended; of a process here, sooner
+                    helper._read_to_its_end()
+                explained = helper._explain(failure, python)
+                helper.close()  # of a channel that is closed nobody learns how it ended; of a process here, sooner
                 if explained is failure:
-                    explained = board._explain(failure, python)
+                    explained = helper._explain(failure, python)
                 raise explained from None
-            return board
+            return helper
 
     def _greet(self, package: bytes, timeout_s: float) -> None:
         expected = ExpectedAnswer(shape=greeting, what="its start")

@@ -68,20 +68,20 @@ class Rebooting:
     def _order(self, connection: Connection) -> tuple[str, float]:
         """Give the order, none to this computer; return which boot is to end, and when that was."""
         layout = Layout(connection.target.root)
-        with Helper.start(connection, PARTS) as board:
-            told = board.call("boot", {"state": layout.state, "root": layout.root}).value
+        with Helper.start(connection, PARTS) as helper:
+            told = helper.call("boot", {"state": layout.state, "root": layout.root}).value
             boot_id = str(told["boot_id"])
             if boot_id == self.own_boot_id:
                 return boot_id, time.monotonic()
-            if board.greeting["uid"] != 0:  # who is root already becomes nobody
+            if helper.greeting["uid"] != 0:  # who is root already becomes nobody
                 require_root(connection.target, ROOT_ADVICE)
             if not self.is_forced:
                 refuse_if_living(told["living"])
                 if told["has_root"]:
-                    _take_lock(board, layout)
+                    _take_lock(helper, layout)
             start_s = time.monotonic()
             try:
-                board.call("reboot", as_root=True, timeout_s=ORDER_TIMEOUT_S)
+                helper.call("reboot", as_root=True, timeout_s=ORDER_TIMEOUT_S)
             except MachineFailure as failure:
                 # A connection that breaks on the order is what it should be: the machine goes down.
                 if failure.kind not in (FailureKind.LOST, FailureKind.TIMEOUT):
@@ -143,10 +143,10 @@ def refuse_if_living(living: Sequence[Mapping[str, Any]]) -> None:
         )
 
 
-def _take_lock(board: Helper, layout: Layout) -> None:
+def _take_lock(helper: Helper, layout: Layout) -> None:
     """Wait for nobody: a machine at which another command works is not rebooted."""
     try:
-        board.call("lock", {"path": layout.lock, "holder": "cosmos reboot"})
+        helper.call("lock", {"path": layout.lock, "holder": "cosmos reboot"})
     except MachineFailure as failure:
         if failure.kind == FailureKind.BUSY:
             raise

@@ -58,9 +58,9 @@ class Fleetwide:
     def look(self, targets: Iterable[Target]) -> list[Outcome[list[Seen]]]:
         """Ask machines what lives there of any run."""
 
-        def ask(target: Target, board: Helper) -> list[Seen]:
+        def ask(target: Target, helper: Helper) -> list[Seen]:
             arguments = {"state": Layout(target.root).state, "ages": True}
-            listed = board.call("processes", arguments).value
+            listed = helper.call("processes", arguments).value
             return [_seen(target.name, dict(mapping)) for mapping in listed]
 
         return self._each(list(targets), ask)
@@ -71,7 +71,7 @@ class Fleetwide:
         """End one run on machines, each in its own directory."""
         by_name = {source.machine: source for source in sources}
 
-        def ask(target: Target, board: Helper) -> RunEnding:
+        def ask(target: Target, helper: Helper) -> RunEnding:
             arguments = {
                 "state": by_name[target.name].state,
                 "directory": by_name[target.name].directory,
@@ -81,7 +81,7 @@ class Fleetwide:
             # An operator there, then those that it leads, then force.
             timeout_s = 2 * (clean_s + forced_s) + ANSWER_MARGIN_S
             return RunEnding.from_mapping(
-                board.call("end_run", arguments, timeout_s=timeout_s).value
+                helper.call("end_run", arguments, timeout_s=timeout_s).value
             )
 
         return self._each([source.target for source in sources], ask)
@@ -96,9 +96,9 @@ class Fleetwide:
         def work(target: Target) -> T:
             with (
                 contextlib.closing(connect(target, self.options)) as connection,
-                Helper.start(connection, PARTS) as board,
+                Helper.start(connection, PARTS) as helper,
             ):
-                return task(target, board)
+                return task(target, helper)
 
         return for_each(targets, work, forks=self.forks, on_done=self.tell) if targets else []
 

@@ -76,7 +76,7 @@ class RemoteMachine:
 
     Args:
         connection: Open; closed by `close`.
-        board: The helper process there.
+        helper: The helper process there.
         prepared: What it said of its environment.
         options: How to connect again.
         connect: Opens a connection.
@@ -85,13 +85,13 @@ class RemoteMachine:
     def __init__(
         self,
         connection: Connection,
-        board: Helper,
+        helper: Helper,
         prepared: Prepared,
         *,
         options: ConnectOptions,
         connect: Connect,
     ) -> None:
-        home = str(board.greeting["home"])
+        home = str(helper.greeting["home"])
         root = expanded(connection.target.root, home)
         self.target = connection.target
         self.connection = connection
@@ -105,10 +105,10 @@ class RemoteMachine:
         )
         self._options = dataclasses.replace(options, timeout_s=RETURN_TIMEOUT_S)
         self._connect = connect
-        self._board: Helper | None = board
+        self._helper: Helper | None = helper
         self._lock = threading.Lock()
         self._connecting = threading.Lock()
-        self.identity = identity_of(board.greeting, connection.target.root)
+        self.identity = identity_of(helper.greeting, connection.target.root)
 
     @property
     def name(self) -> str:
@@ -131,13 +131,13 @@ class RemoteMachine:
         if not self._lock.acquire(timeout=timeout_s):
             raise MachineFailure(FailureKind.TIMEOUT, f"another question took over {timeout_s:g} s")
         try:
-            if self._board is None:
-                self._board = Helper.start(self.connection, PARTS, timeout_s=timeout_s)
-            return self._board.call(verb, arguments, timeout_s=timeout_s).value
+            if self._helper is None:
+                self._helper = Helper.start(self.connection, PARTS, timeout_s=timeout_s)
+            return self._helper.call(verb, arguments, timeout_s=timeout_s).value
         except MachineFailure as failure:
-            if failure.kind in OUT_OF_STEP and self._board is not None:
-                board, self._board = self._board, None
-                board.close()
+            if failure.kind in OUT_OF_STEP and self._helper is not None:
+                helper, self._helper = self._helper, None
+                helper.close()
             raise
         finally:
             self._lock.release()
@@ -204,10 +204,10 @@ class RemoteMachine:
 
     def _drop_helper(self) -> None:
         if self._lock.acquire(timeout=ASK_TIMEOUT_S):
-            board, self._board = self._board, None
+            helper, self._helper = self._helper, None
             self._lock.release()
-            if board is not None:
-                board.close()
+            if helper is not None:
+                helper.close()
 
 
 def reach_machines(  # noqa: PLR0913 - how machines are reached and prepared; all by name
@@ -231,9 +231,9 @@ def reach_machines(  # noqa: PLR0913 - how machines are reached and prepared; al
     def reach(target: Target) -> RemoteMachine:
         with contextlib.ExitStack() as opened:
             connection = opened.enter_context(contextlib.closing(connect(target, options)))
-            board = opened.enter_context(Helper.start(connection, (*PARTS, *parts)))
+            helper = opened.enter_context(Helper.start(connection, (*PARTS, *parts)))
             machine = RemoteMachine(
-                connection, board, prepare(target, board), options=options, connect=connect
+                connection, helper, prepare(target, helper), options=options, connect=connect
             )
             opened.pop_all()  # whoever has the machine closes them
             return machine

@@ -56,9 +56,9 @@ def reach(
     cargo = cargo_of(scenario, plan.elsewhere, say)
     host = plan.host.name if plan.host else None
 
-    def prepare(target: Target, board: Helper) -> Prepared:
+    def prepare(target: Target, helper: Helper) -> Prepared:
         return make_ready(
-            board,
+            helper,
             target,
             cargo,
             machine=plan.involved[target.name],

@@ -207,19 +207,19 @@ class Rehearsal:
         is_host = self.plan.host is not None and self.plan.host.name == machine.name
         agents = len(self.plan.agents_by_machine.get(machine.name, ()))
         layout = Layout(machine.variables.root)
-        with Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as board:
-            key = environment_key_of(board, cargo, machine, is_host=is_host)
+        with Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as helper:
+            key = environment_key_of(helper, cargo, machine, is_host=is_host)
             trees = cargo.trees(machine.name)
             request = installed_request(
                 layout, trees=[tree.hash for tree in trees], environments=[key]
             )
-            installed = ask_installed(board, request)
+            installed = ask_installed(helper, request)
             missing = [tree for tree in trees if not installed.trees[tree.hash]]
-            told = board.call("facts", {"root": layout.root}, timeout_s=TIMEOUT_S).value
-            processes = board.call("processes", {"state": layout.state}, timeout_s=TIMEOUT_S).value
-            trips = self._trips(board, connection, machine, responder)
+            told = helper.call("facts", {"root": layout.root}, timeout_s=TIMEOUT_S).value
+            processes = helper.call("processes", {"state": layout.state}, timeout_s=TIMEOUT_S).value
+            trips = self._trips(helper, connection, machine, responder)
         return MachineRehearsal(
-            identity=identity_of(board.greeting, layout.root),
+            identity=identity_of(helper.greeting, layout.root),
             agents=agents,
             is_host=is_host,
             opening_ms=connection.opening_s * 1e3,
@@ -234,7 +234,7 @@ class Rehearsal:
         )
 
     def _trips(
-        self, board: Helper, connection: Connection, machine: Machine, responder: Responder
+        self, helper: Helper, connection: Connection, machine: Machine, responder: Responder
     ) -> Mapping[str, Any] | None:
         """Try datagrams to this computer; None where the run's host is another, and in lockstep."""
         if self.plan.host is not None:
@@ -247,7 +247,7 @@ class Rehearsal:
             "nonce_hex": responder.nonce.hex(),
             "count": ROUND_TRIP_COUNT,
         }
-        told: Mapping[str, Any] = board.call("round_trips", arguments, timeout_s=TIMEOUT_S).value
+        told: Mapping[str, Any] = helper.call("round_trips", arguments, timeout_s=TIMEOUT_S).value
         return told
 
     def _record_bytes(self, agents: int) -> int:

@@ -151,8 +151,8 @@ def _up_lines(
 
             def plan_one(connection: Connection) -> up_table.MachineResult | None:
                 watch = SilenceWatch(connection)
-                with Helper.start(connection, HELPER_PARTS, watch=watch) as board:
-                    return fleet_up.bring(connection, board)
+                with Helper.start(connection, HELPER_PARTS, watch=watch) as helper:
+                    return fleet_up.bring(connection, helper)
 
             results = [up_table.result_of(outcome) for outcome in fleet.each_target(plan_one)]
     except CosmosError as error:

@@ -100,9 +100,9 @@ class MachineSampler:
         Raises:
             MachineFailure: It has no environment, what drives them failed or did not end in time, or it is lost.
         """
-        with Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as board:
-            asked = self._asked(board, machine, launches) | {"has_records": records is not None}
-            answers = board.parts(
+        with Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as helper:
+            asked = self._asked(helper, machine, launches) | {"has_records": records is not None}
+            answers = helper.parts(
                 VERB, asked, timeout_s=SIGN_TIMEOUT_S, whole_s=asked["timeout_s"] + ENDING_S
             )
             told, said = read_answer(answers, records)
@@ -113,11 +113,11 @@ class MachineSampler:
         return checked_devices(told, launches)
 
     def _asked(
-        self, board: Helper, machine: Machine, launches: Sequence[DeviceLaunch]
+        self, helper: Helper, machine: Machine, launches: Sequence[DeviceLaunch]
     ) -> dict[str, Any]:
         """Send what is quick to send, and return the arguments of the verb."""
-        layout = Layout(at_home(machine.variables.root, str(board.greeting["home"])))
-        python = layout.python(self._environment(board, machine, layout))
+        layout = Layout(at_home(machine.variables.root, str(helper.greeting["home"])))
+        python = layout.python(self._environment(helper, machine, layout))
         drivers = self._drivers.get(machine.name)
         folder = drivers.directory(layout.tree(drivers.tree.hash)) if drivers else layout.root
         devices = [
@@ -141,7 +141,7 @@ class MachineSampler:
             },
         }
 
-    def _environment(self, board: Helper, machine: Machine, layout: Layout) -> str:
+    def _environment(self, helper: Helper, machine: Machine, layout: Layout) -> str:
         """Return the key of the environment that is there, and see that code is."""
         keys = [
             key
@@ -149,7 +149,7 @@ class MachineSampler:
             if (
                 key := remembered_key(
                     EnvironmentNeed.of_machine(
-                        board.greeting,
+                        helper.greeting,
                         machine.variables,
                         (),
                         is_host=is_host,
@@ -163,7 +163,7 @@ class MachineSampler:
         request = installed_request(
             layout, trees=[tree.hash for tree in trees], environments=keys, touch=bool(keys)
         )
-        found = ask_installed(board, request)
+        found = ask_installed(helper, request)
         key = next((key for key in keys if found.environments[key]), None)
         if key is None:
             raise MachineFailure(
@@ -173,7 +173,7 @@ class MachineSampler:
             )
         for tree in trees:
             if not found.trees[tree.hash]:
-                send_tree(board, layout, tree)
+                send_tree(helper, layout, tree)
         return key
 
 

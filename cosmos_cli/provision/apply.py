@@ -39,12 +39,12 @@ class Applier:
     Carries steps out on one machine.
 
     Args:
-        board: What works there, started with all parts that steps need.
+        helper: What works there, started with all parts that steps need.
         layout: Of the machine.
         teller: Told each step as it begins, and how far a long one is.
     """
 
-    board: Helper
+    helper: Helper
     layout: Layout
     teller: MachineTeller
     done: list[Done] = field(default_factory=list)
@@ -60,7 +60,7 @@ class Applier:
         for step in steps:
             self.teller.step(step.title)
             try:
-                with timed(self.board.machine, step.title):
+                with timed(self.helper.machine, step.title):
                     changed = self._carry_out(step)
             except MachineFailure as failure:
                 raise _of_step(step, failure) from None
@@ -68,16 +68,16 @@ class Applier:
 
     def _carry_out(self, step: Step) -> bool:
         if step.kind in _SENDERS:
-            return _SENDERS[step.kind](self.board, self.layout, step.subject, self._tell_share)
+            return _SENDERS[step.kind](self.helper, self.layout, step.subject, self._tell_share)
         return any([self._ask(request, step) for request in step.requests])  # every one is asked
 
     def _ask(self, request: StepRequest, step: Step) -> bool:
         how: dict[str, Any] = {"as_root": request.as_root, "timeout_s": request.timeout_s}
         if not request.streams:
-            answer = self.board.call(request.verb, request.arguments, body=request.body, **how)
+            answer = self.helper.call(request.verb, request.arguments, body=request.body, **how)
             return _has_changed(request.verb, answer.value)
         value: Mapping[str, Any] = {}
-        for part in self.board.parts(
+        for part in self.helper.parts(
             request.verb, request.arguments, **how, whole_s=request.whole_s
         ):
             value = part.value or {}

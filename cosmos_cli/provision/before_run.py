@@ -104,7 +104,7 @@ def cargo_of(
 
 
 def make_ready(
-    board: Helper,
+    helper: Helper,
     target: Target,
     cargo: Cargo,
     *,
@@ -115,7 +115,7 @@ def make_ready(
     See that a machine has what a run needs, and send what is quick to send.
 
     Args:
-        board: Started on it with `cosmos_cli.provision.STORE_PARTS`.
+        helper: Started on it with `cosmos_cli.provision.STORE_PARTS`.
         target: The machine.
         cargo: What is run.
         machine: Its entry in the inventory, for its own requirements.
@@ -124,11 +124,11 @@ def make_ready(
     Raises:
         MachineFailure: Its environment is not there or damaged; the advice is the command that makes it.
     """
-    layout = Layout(at_home(target.root, str(board.greeting["home"])))
-    key = environment_key_of(board, cargo, machine, is_host=is_host)
+    layout = Layout(at_home(target.root, str(helper.greeting["home"])))
+    key = environment_key_of(helper, cargo, machine, is_host=is_host)
     trees = cargo.trees(target.name)
     found = ask_installed(
-        board,
+        helper,
         installed_request(
             layout,
             trees=[tree.hash for tree in trees],
@@ -145,7 +145,7 @@ def make_ready(
         )
     for tree in trees:
         if not found.trees[tree.hash]:
-            send_tree(board, layout, tree)
+            send_tree(helper, layout, tree)
     drivers = cargo.drivers.get(target.name)
     return Ready(
         python=layout.python(key),
@@ -156,13 +156,13 @@ def make_ready(
 
 
 def environment_key_of(
-    board: Helper, cargo: Cargo, machine: Machine | None, *, is_host: bool
+    helper: Helper, cargo: Cargo, machine: Machine | None, *, is_host: bool
 ) -> str:
     """Return the key of the environment that a machine must have for a run."""
     variables = machine.variables if machine is not None else Variables()
     needs = cargo.needs.get(machine.name, NO_NEEDS) if machine is not None else NO_NEEDS
     return environment_key(
         EnvironmentNeed.of_machine(
-            board.greeting, variables, cargo.requirements, is_host=is_host, needs=needs
+            helper.greeting, variables, cargo.requirements, is_host=is_host, needs=needs
         )
     )

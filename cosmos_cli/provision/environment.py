@@ -107,28 +107,28 @@ def installed_request(
     }
 
 
-def ask_installed(board: Helper, request: Mapping[str, Any]) -> Installed:
+def ask_installed(helper: Helper, request: Mapping[str, Any]) -> Installed:
     """
     Ask a machine what is installed there.
 
     Args:
-        board: Started with `cosmos_cli.provision.STORE_PARTS`.
+        helper: Started with `cosmos_cli.provision.STORE_PARTS`.
         request: Made by `installed_request`.
 
     Raises:
         MachineFailure: The connection is lost.
     """
-    return Installed.from_mapping(board.call("installed", request, timeout_s=LOOK_TIMEOUT_S).value)
+    return Installed.from_mapping(helper.call("installed", request, timeout_s=LOOK_TIMEOUT_S).value)
 
 
 def install_environment(
-    board: Helper, layout: Layout, environment: Environment, progress: Progress = no_progress
+    helper: Helper, layout: Layout, environment: Environment, progress: Progress = no_progress
 ) -> bool:
     """
     See that an environment is on a machine; wheels that are there already are not sent.
 
     Args:
-        board: Started with `cosmos_cli.provision.STORE_PARTS`, holding the machine's lock.
+        helper: Started with `cosmos_cli.provision.STORE_PARTS`, holding the machine's lock.
         layout: Of the machine.
         environment: What is wanted.
         progress: Told while wheels are sent and installed.
@@ -156,15 +156,15 @@ def install_environment(
             for each in sent
         ],
     }
-    told: Mapping[str, Any] = board.call("environment", asked, timeout_s=BUILD_TIMEOUT_S).value
+    told: Mapping[str, Any] = helper.call("environment", asked, timeout_s=BUILD_TIMEOUT_S).value
     if told["changed"] or not told["missing"]:
         return bool(told["changed"])
-    check_distribution(board, environment)
+    check_distribution(helper, environment)
     have = {each["sha256"]: each["have"] for each in told["missing"]}
     wheels = [(each, have[each.locked.sha256]) for each in sent if each.locked.sha256 in have]
-    _send_wheels(board, layout, wheels, progress)
+    _send_wheels(helper, layout, wheels, progress)
     progress("installing", 1.0)
-    told = board.call("environment", asked, timeout_s=BUILD_TIMEOUT_S).value
+    told = helper.call("environment", asked, timeout_s=BUILD_TIMEOUT_S).value
     if told["missing"]:
         raise MachineFailure(
             FailureKind.DATA, "wheels that were sent are not there", "repeat the command"
@@ -192,7 +192,7 @@ def _sent_wheels(environment: Environment) -> list[SentWheel]:
     return found
 
 
-def check_distribution(board: Helper, environment: Environment) -> None:
+def check_distribution(helper: Helper, environment: Environment) -> None:
     """
     See that the machine's distribution has what no wheel brings, new enough.
 
@@ -203,7 +203,7 @@ def check_distribution(board: Helper, environment: Environment) -> None:
     if not wanted:
         return
     names = {"names": [each.name for each in wanted]}
-    found: Mapping[str, str | None] = board.call("versions", names, timeout_s=LOOK_TIMEOUT_S).value
+    found: Mapping[str, str | None] = helper.call("versions", names, timeout_s=LOOK_TIMEOUT_S).value
     faults, packages = [], []
     for each in wanted:
         version = found[each.name]
@@ -251,7 +251,7 @@ def modules_of(environment: Environment) -> tuple[str, ...]:
 
 
 def _send_wheels(
-    board: Helper,
+    helper: Helper,
     layout: Layout,
     wheels: Sequence[tuple[SentWheel, int]],
     progress: Progress,
@@ -278,7 +278,7 @@ def _send_wheels(
                 have
             ]:  # all of it may have come, before the connection was cut
                 piece = content[offset : offset + PIECE_BYTES]
-                board.call(
+                helper.call(
                     "wheel",
                     {**arguments, "offset": offset},
                     body=piece,

@@ -55,13 +55,13 @@ def fact_calls(
 
 
 def gather_facts(
-    board: Helper, calls: Sequence[Call], *, may_become_root: bool
+    helper: Helper, calls: Sequence[Call], *, may_become_root: bool
 ) -> tuple[MachineFacts, list[Answer]]:
     """
     Ask for all facts at once.
 
     Args:
-        board: Started with `cosmos_cli.provision.HELPER_PARTS`.
+        helper: Started with `cosmos_cli.provision.HELPER_PARTS`.
         calls: Those of `fact_calls`, and others for the same frame.
         may_become_root: Whether root is asked about what the user is not shown.
 
@@ -72,7 +72,7 @@ def gather_facts(
         MachineFailure: The connection is lost, or a condition of a command did not end in time.
     """
     asked_utc_s = _utc_s()
-    told, installed, *others = several(board, calls)
+    told, installed, *others = several(helper, calls)
     raise_first([told, installed])
     facts = MachineFacts.from_mapping(
         told["value"], asked_utc_s=asked_utc_s, answered_utc_s=_utc_s()
@@ -82,15 +82,15 @@ def gather_facts(
         is_root = facts.uid == 0  # needs no sudo
         refusal = "" if is_root else ROOT_FORBIDDEN
         return dataclasses.replace(facts, can_become_root=is_root, sudo_refusal=refusal), others
-    return _with_root(board, facts, calls[0]["arguments"]), others
+    return _with_root(helper, facts, calls[0]["arguments"]), others
 
 
-def several(board: Helper, calls: Sequence[Call]) -> list[Answer]:
+def several(helper: Helper, calls: Sequence[Call]) -> list[Answer]:
     """Ask several things in one frame; nothing is asked where there is nothing to ask."""
     if not calls:
         return []
     timeout_s = LOOK_TIMEOUT_S * len(calls)
-    return list(board.call("several", {"calls": list(calls)}, timeout_s=timeout_s).value)
+    return list(helper.call("several", {"calls": list(calls)}, timeout_s=timeout_s).value)
 
 
 def raise_first(answers: Sequence[Answer]) -> None:
@@ -121,7 +121,7 @@ def _with_installed(facts: MachineFacts, told: Mapping[str, Any]) -> MachineFact
     )
 
 
-def _with_root(board: Helper, facts: MachineFacts, asked: Mapping[str, Any]) -> MachineFacts:
+def _with_root(helper: Helper, facts: MachineFacts, asked: Mapping[str, Any]) -> MachineFacts:
     """Ask root about what the user is not shown; where nobody becomes root it stays unknown."""
     files = {
         path: asked["files"][path] for path, fact in facts.files.items() if fact.kind == "denied"
@@ -134,7 +134,7 @@ def _with_root(board: Helper, facts: MachineFacts, asked: Mapping[str, Any]) -> 
     if not files and not conditions:
         return facts
     try:
-        told = board.call(
+        told = helper.call(
             "look",
             {"files": files, "conditions": conditions},
             as_root=True,

@@ -162,12 +162,12 @@ def folder_tree(label: str, folder: Path) -> Tree:
     return tree_of(label, [read_tree_file(*each) for each in found])
 
 
-def send_tree(board: Helper, layout: Layout, tree: Tree, progress: Progress = no_progress) -> bool:
+def send_tree(helper: Helper, layout: Layout, tree: Tree, progress: Progress = no_progress) -> bool:
     """
     See that a tree is on a machine; what is there already is verified, not sent.
 
     Args:
-        board: Started with `cosmos_cli.provision.STORE_PARTS`.
+        helper: Started with `cosmos_cli.provision.STORE_PARTS`.
         layout: Of the machine.
         tree: What is wanted.
         progress: Told while files are sent.
@@ -186,10 +186,10 @@ def send_tree(board: Helper, layout: Layout, tree: Tree, progress: Progress = no
     }
     by_hash = {file.sha256: file for file in reversed(tree.files)}  # one of equal ones
     for _ in range(ROUNDS_MAX):
-        told: Mapping[str, Any] = board.call("tree", asked, timeout_s=ASSEMBLE_TIMEOUT_S).value
+        told: Mapping[str, Any] = helper.call("tree", asked, timeout_s=ASSEMBLE_TIMEOUT_S).value
         if not told["missing"]:
             return bool(told["changed"])
-        _send_blobs(board, layout, [by_hash[sha256] for sha256 in told["missing"]], progress)
+        _send_blobs(helper, layout, [by_hash[sha256] for sha256 in told["missing"]], progress)
     raise MachineFailure(
         FailureKind.DATA,
         f"{tree.label}: files that were sent are not there ({len(told['missing'])} missing)",
@@ -198,7 +198,7 @@ def send_tree(board: Helper, layout: Layout, tree: Tree, progress: Progress = no
 
 
 def _send_blobs(
-    board: Helper, layout: Layout, files: Sequence[TreeFile], progress: Progress
+    helper: Helper, layout: Layout, files: Sequence[TreeFile], progress: Progress
 ) -> None:
     whole_bytes = sum(file.size_bytes for file in files)
     sent_bytes = 0
@@ -208,7 +208,7 @@ def _send_blobs(
             "folder": layout.trees,
             "blobs": [[file.sha256, file.size_bytes] for file in batch],
         }
-        board.call("blobs", arguments, body=body, timeout_s=ASSEMBLE_TIMEOUT_S)
+        helper.call("blobs", arguments, body=body, timeout_s=ASSEMBLE_TIMEOUT_S)
         sent_bytes += sum(file.size_bytes for file in batch)
         progress(f"files {sent_bytes / 1e6:.1f} MB", sent_bytes / max(1, whole_bytes))
 

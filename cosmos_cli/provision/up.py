@@ -78,7 +78,7 @@ class MachineUp:
 
     Args:
         connection: To the machine.
-        board: Started there with `cosmos_cli.provision.HELPER_PARTS`.
+        helper: Started there with `cosmos_cli.provision.HELPER_PARTS`.
         machine: Its entry in the inventory.
         resources: What it is made ready with.
         options: What was asked for.
@@ -87,7 +87,7 @@ class MachineUp:
     """
 
     connection: Connection
-    board: Helper
+    helper: Helper
     machine: Machine
     resources: UpResources
     options: UpOptions
@@ -127,7 +127,7 @@ class MachineUp:
             self.result.done = [*self.result.done, check]
 
     def _desired(self) -> DesiredState:
-        greeting = self.board.greeting
+        greeting = self.helper.greeting
         desired = desired_state(
             self.machine.variables,
             home=str(greeting["home"]),
@@ -146,7 +146,7 @@ class MachineUp:
         self.result.done = [Done(step=step, changed=True) for step in steps]
 
     def _change(self, desired: DesiredState) -> None:
-        applier = Applier(board=self.board, layout=desired.layout, teller=self.teller)
+        applier = Applier(helper=self.helper, layout=desired.layout, teller=self.teller)
         self.result.done = applier.done
         try:
             self._apply(desired, applier)
@@ -162,7 +162,7 @@ class MachineUp:
         kind = machine_kind(self._facts, desired)
         with self.resources.full_checks.turn(kind) as is_full:
             checks = self.resources.checks(desired, udp, depth="full" if is_full else "start")
-            self._raise_first(several(self.board, checks), udp)
+            self._raise_first(several(self.helper, checks), udp)
 
     def _apply(self, desired: DesiredState, applier: Applier) -> None:
         """Make the folders, for the lock is in one of them; lock; look again; do the rest."""
@@ -187,7 +187,7 @@ class MachineUp:
         applier.apply(steps)
 
     def _ask(self, request: StepRequest) -> None:
-        self.board.call(request.verb, request.arguments, body=request.body)
+        self.helper.call(request.verb, request.arguments, body=request.body)
 
     @property
     def _facts(self) -> MachineFacts:
@@ -204,7 +204,7 @@ class MachineUp:
         until_s = time.monotonic() + LOCK_WAIT_S
         while True:
             try:
-                self.board.call("lock", arguments)
+                self.helper.call("lock", arguments)
                 return
             except MachineFailure as failure:
                 if failure.kind is not FailureKind.BUSY or time.monotonic() > until_s:
@@ -228,7 +228,7 @@ class MachineUp:
             touch=touch,
         )
         self.result.facts, others = gather_facts(
-            self.board, [*calls, *also], may_become_root=desired.variables.may_become_root
+            self.helper, [*calls, *also], may_become_root=desired.variables.may_become_root
         )
         return others
 
@@ -312,12 +312,12 @@ class FleetUp:
         """Show what is worth a word before any machine is worked on."""
         self._view.say(f"warning: {remark}")
 
-    def bring(self, connection: Connection, board: Helper) -> MachineResult:
-        """Make one machine ready; *board* is started there with HELPER_PARTS."""
+    def bring(self, connection: Connection, helper: Helper) -> MachineResult:
+        """Make one machine ready; *helper* is started there with HELPER_PARTS."""
         name = connection.target.name
         return MachineUp(
             connection=connection,
-            board=board,
+            helper=helper,
             machine=self._machines[name],
             resources=self._resources,
             options=self._options,

@@ -107,10 +107,10 @@ class Listener:
 def up(connection, machine, kit=None, listener=None, **options):
     """Return what became of a machine, as the command line does it."""
     try:
-        with Helper.start(connection, HELPER_PARTS, watch=SilenceWatch(connection)) as board:
+        with Helper.start(connection, HELPER_PARTS, watch=SilenceWatch(connection)) as helper:
             return MachineUp(
                 connection=connection,
-                board=board,
+                helper=helper,
                 machine=machine,
                 resources=kit or FakeKit(),
                 options=UpOptions(**options),

@@ -155,9 +155,9 @@ def test_plan_that_needs_root_is_refused_with_its_steps_where_nobody_becomes_roo
 def test_inventory_that_forbids_sudo_is_blamed_and_root_needs_none(uid, can):
     nothing = {"trees": {}, "environments": {}}
     answers = [{"ok": True, "value": value} for value in (told(user={"id": uid}), nothing)]
-    board = SimpleNamespace(call=lambda *asked, **how: SimpleNamespace(value=answers))
+    helper = SimpleNamespace(call=lambda *asked, **how: SimpleNamespace(value=answers))
 
-    facts, _ = gather_facts(board, [{"arguments": {}}] * 2, may_become_root=False)
+    facts, _ = gather_facts(helper, [{"arguments": {}}] * 2, may_become_root=False)
 
     assert facts.can_become_root is can
     if can:
@@ -262,7 +262,7 @@ def test_check_blames_no_server_for_a_limit_that_is_still_to_be_set(is_planned, 
     facts = facts_of(uses_pam=True)
     steps = plan_steps(facts, wants) if is_planned else ()
     result = MachineResult(machine="pi01", facts=facts, planned=steps)
-    others = dict.fromkeys(("connection", "board", "machine", "resources", "teller"))
+    others = dict.fromkeys(("connection", "helper", "machine", "resources", "teller"))
     options = UpOptions(is_check=True, has_texts=False, host=None)
 
     MachineUp(**others, options=options, result=result)._note(wants)
