@@ -13,9 +13,9 @@ from pathlib import Path
 
 SOCKET_MODE = 0o600
 UNNAMED_SUFFIX = ".new"
-"""Behind the name of one that does not listen yet."""
+"""Suffix of the name of a socket that does not listen yet."""
 SOCKET_PATH_BYTES_MAX = 96
-"""Of a path that every system takes, also with that suffix; a longer one is reached through its folder's descriptor."""
+"""Bytes of a path that every system takes, also with that suffix; longer ones go through their folder's descriptor."""
 
 
 @contextlib.contextmanager

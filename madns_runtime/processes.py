@@ -29,7 +29,7 @@ Role = Literal["operator", "host", "supervisor", "agent"]
 
 FILE_BYTES_MAX = 16_384
 NAME_CHARACTERS_MAX = 200
-"""Of a process of many agents, whose name lists them all, so much is entered."""
+"""Characters entered of the name of a process of many agents, which lists them all."""
 NOT_THERE = (FileNotFoundError, ProcessLookupError, PermissionError)
 """Errors by which /proc tells that a process has ended, or that its number is another user's now, whom it may hide."""
 SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)

@@ -34,7 +34,7 @@ LOOK_INTERVAL_S = 0.5
 AGAIN_S = 5.0
 ANSWER_TIMEOUT_S = 60.0
 ABSENCE_S = 60.0
-"""For so long the host's machine may give no answer before the run is followed no more: a board has started anew by then."""
+"""Time without an answer of the host's machine after which its run is followed no more: a board has rebooted by then."""
 PASSING = frozenset(
     {
         FailureKind.UNREACHABLE,

@@ -22,15 +22,15 @@ from cosmos_cli.ui.plural import counted
 from madns_runtime.plain_values import first_few
 
 ROUNDS_MAX = 3
-"""So often a machine's files are listed anew when they changed on the way."""
+"""Rounds at most; a machine's files are listed anew in each, where they changed on the way."""
 FAULTS_SHOWN_MAX = 5
 PATIENCE_S = 30.0
-"""For what ends there at this moment, such as a sampler after its supervisor: on a busy board with a slow card, too."""
+"""Wait for what ends there at this moment, such as a sampler after its supervisor, on a busy board with a slow card."""
 PIECE_TIMEOUT_S = 30.0
 SIZES_TIMEOUT_S = 300.0
-"""For the sizes of FILES_MAX files on a slow card."""
+"""Time for the sizes of FILES_MAX files on a slow card."""
 STANDSTILL_S = 120.0
-"""So long a transfer may bring nothing; how long it may take beside is told by what it brings."""
+"""Time in which a transfer may bring nothing; as long as it brings something it goes on."""
 RELEASE_TIMEOUT_S = 120.0
 KEPT_KINDS = (FailureKind.BUSY, FailureKind.DEFECT)
 """Failures of a release that are no mere remark."""
@@ -51,12 +51,12 @@ class Retrieved:
     files: int
     bytes: int
     fetched_files: int = 0
-    """Of these, those that came this time."""
+    """Number of these that came this time."""
     fetched_bytes: int = 0
     packed_bytes: int = 0
-    """The same, as they came over the wire."""
+    """The fetched bytes as they came over the wire."""
     resumed_bytes: int = 0
-    """Of files that came this time, what an earlier attempt had brought."""
+    """Bytes of files that came this time which an earlier attempt had brought."""
     is_released: bool = True
     remark: str = ""
     """Why all of it still lies there as well; empty if it does not."""

@@ -29,7 +29,7 @@ class RecordingMachine:
 
     @property
     def state(self) -> str:
-        """Its register of processes."""
+        """The machine's register of processes."""
         return Layout(self.target.root).state
 
     @property

@@ -34,7 +34,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.onboard.records import PIECE_BYTES
 
 FILES_AT_ONCE_MAX = 200
-"""So many files are brought to the disk and to their names together: their descriptors are open at once."""
+"""Files that are brought to the disk and to their names together: their descriptors are open at once."""
 
 
 @dataclass(slots=True)
@@ -46,7 +46,7 @@ class Transfer:
     offset: int = 0
     """Bytes that are in the part."""
     resumed_bytes: int = 0
-    """Of those, what an earlier attempt had brought."""
+    """Bytes of those that an earlier attempt had brought."""
     digest: Any = field(default_factory=hashlib.sha256)
 
     @property

@@ -57,7 +57,7 @@ class Offer:
 
     @property
     def size_bytes(self) -> int:
-        """Of all files."""
+        """Bytes of all files."""
         return sum(file.size_bytes for file in self.files)
 
 

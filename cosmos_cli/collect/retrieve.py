@@ -31,9 +31,9 @@ from cosmos_cli.ui.plural import counted
 
 PARTS = ("madns_runtime.processes", "processes", "records")
 ATTEMPTS_MAX = 5
-"""So often a broken link is made anew, as long as attempts bring something."""
+"""Attempts at most: a broken link is made anew as long as they bring something."""
 BARREN_MAX = 2
-"""So many attempts in a row may bring nothing, such as those that broke while the link was opened."""
+"""Attempts in a row that may bring nothing, such as those that broke while the link was opened."""
 PAUSE_S = 1.0
 TOLD_INTERVAL_S = 0.1
 BROKEN = (FailureKind.LOST, FailureKind.TIMEOUT)
@@ -257,7 +257,7 @@ def _is_worth_another(failure: MachineFailure, barren: int) -> bool:
 
 
 class _Visit:
-    """A connection and what works at its other end."""
+    """A connection and the helper at its other end."""
 
     def __init__(self, connection: Connection, helper: Helper, *, is_given: bool) -> None:
         self.helper = helper
@@ -265,7 +265,7 @@ class _Visit:
         self._is_given = is_given
 
     def close(self, *, at_once: bool = False) -> None:
-        """End it; *at_once* while a thread may still use it: the connection alone, which ends the rest."""
+        """End the visit; *at_once*, while a thread may still use it, closes the connection alone, which ends the rest."""
         if not at_once:
             self.helper.close()
         if not self._is_given:

@@ -38,12 +38,12 @@ class RunThere:
     """One run's directory on a machine."""
 
     name: str
-    """Of the directory: the run's name and the begin of its session."""
+    """Name of the directory: the run's name and the beginning of its session."""
     state: State
     files: int
     bytes: int
     newest_s: int
-    """Its newest change, s since 1970."""
+    """Time of the newest change, s since 1970."""
     living: tuple[str, ...] = ()
     here: str | None = None
     """Place of its copy here."""
@@ -66,11 +66,11 @@ class Findings:
 
     runs: tuple[RunThere, ...]
     installed_bytes: Mapping[str, int] = field(default_factory=dict)
-    """Of environments, trees and wheels; only when all of it is to go."""
+    """Bytes of environments, trees and wheels; only when all of it is to go."""
     others: tuple[str, ...] = ()
     """Files in COSMoS's folder that are not COSMoS's."""
     living: tuple[str, ...] = ()
-    """Of any run; only when all of it is to go."""
+    """What lives there of any run; only when all of it is to go."""
     has_root: bool = False
 
 
@@ -82,7 +82,7 @@ class Order:
     kept: tuple[RunThere, ...] = ()
     is_root: bool = False
     installed_bytes: int = 0
-    """Of environments, trees and wheels, if they go."""
+    """Bytes of environments, trees and wheels, if they go."""
 
     @property
     def is_empty(self) -> bool:
@@ -91,7 +91,7 @@ class Order:
 
     @property
     def bytes(self) -> int:
-        """Of all that goes."""
+        """Bytes of all that goes."""
         return sum(run.bytes for run in self.runs) + self.installed_bytes
 
 

@@ -20,7 +20,7 @@ AGENT_STREAMS = tuple(schema.name for schema in (TICKS, CLOCK, EVENTS, LOG, PROC
 HOST_STREAMS = tuple(schema.name for schema in (EVENTS, LOG, HEALTH))
 MACHINE_STREAMS = (HEALTH.name,)
 LOCKSTEP_STREAMS = (EVENTS.name, LOG.name)
-"""Of host and agents where no time is kept: there are no machines' clocks, lateness or health to record."""
+"""Streams of host and agents in lockstep: there are no machines' clocks, lateness or health to record."""
 FAULTS_SHOWN_MAX = 3
 HOST = "host"
 LOCKSTEP = "lockstep"

@@ -35,7 +35,7 @@ USUAL: Final = frozenset({"replay", "old_incarnation"})
 FOREIGN_MAX: Final = 10
 """More datagrams than this, refused for a reason that is not usual, are worth a remark: somebody else sends."""
 USUAL_MAX: Final = 1000
-"""The same of the usual reasons."""
+"""The same bound for the usual reasons."""
 
 
 def packet_counts(

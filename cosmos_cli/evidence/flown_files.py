@@ -16,7 +16,7 @@ from typing import Any, Final
 from cosmos_cli.ui.foreign_text import clean_line
 
 FOLDER: Final = "flown"
-"""Of the copy, in the run's directory."""
+"""Name of the copy's folder in the run's directory."""
 KEY: Final = "flown"
 """In run.json."""
 FILES_MAX: Final = 2_000
@@ -25,7 +25,7 @@ FILE_BYTES_MAX: Final = 8 * 1024 * 1024
 COPY_BYTES_MAX: Final = 64 * 1024 * 1024
 """All copied files together: the smallest come first."""
 HASHED_BYTES_MAX: Final = 256 * 1024 * 1024
-"""Of files that are too large to copy: so many bytes of them are hashed."""
+"""Bytes that are hashed of files that are too large to copy."""
 NAME_BYTES_MAX: Final = 1024
 LEFT_OUT_SHOWN_MAX: Final = 20
 SHA256: Final = re.compile(r"[0-9a-f]{64}")

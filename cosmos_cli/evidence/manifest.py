@@ -23,7 +23,7 @@ from madns_runtime.recording.access import file_mode
 
 MANIFEST_NAME = "manifest.json"
 PATH_BYTES_MAX = 4096
-"""Of a path that the system takes, its end mark included."""
+"""Bytes of a path that the system takes, its end mark included."""
 COMPRESSION_LEVEL = 3
 
 

@@ -32,7 +32,7 @@ QUEUE_MIB = LinkLimits().send_queue_bytes_max // 2**20
 NOT_DECLARED = "not declared by the simulation's streams()"
 
 Declared = Mapping[tuple[str, str], DeclaredStream]
-"""By role and name."""
+"""Declared streams by role and name."""
 
 
 def result_remarks(

@@ -96,7 +96,7 @@ class RunDirectory:
 
     @property
     def left_result_json(self) -> Path:
-        """The same, as the host leaves it beside its records: its line to the operator may be cut."""
+        """The host's result as it leaves it beside its records: its line to the operator may be cut."""
         return self.path / "host/result.json"
 
     @property

@@ -63,7 +63,7 @@ class LogReading:
     sources: set[str] = field(default_factory=set)
     """Sources that have a log at all."""
     zeros_s: dict[str, float] = field(default_factory=dict)
-    """By file: simulated time zero by the clock of who wrote it, as a POSIX time, s."""
+    """Simulated time zero, as a POSIX time by the clock of who wrote it, s; by file."""
 
     def read_here(self, directory: Path, *, is_ended: bool = False) -> Iterator[list[LogLine]]:
         """

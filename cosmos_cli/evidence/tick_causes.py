@@ -98,7 +98,7 @@ WORDS: Final[Mapping[str, CauseWords]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentCauses:
-    """Of one agent: ticks by cause, and how many of them were missed."""
+    """Ticks of one agent by cause, and how many of them were missed."""
 
     causes: Mapping[str, int]
     missed: int

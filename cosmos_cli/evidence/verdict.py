@@ -40,7 +40,7 @@ class CheckResult:
     """Source of the worst value, where there are many: an agent, the host, a stream. In the framework's checks `got` is the
     value of all of them together, in others that of this source."""
     agent: str | None = None
-    """Of an expectation: the agent of this value, or host."""
+    """Agent of this value, or host; an expectation's alone."""
     t_s: float | None = None
     """Simulated time of this value, s."""
     unit: str | None = None
@@ -126,12 +126,12 @@ class RunFacts:
     records_not_finite: int = 0
     """Values of all records that were NaN or infinite."""
     worst: Mapping[str, str] = field(default_factory=dict)
-    """By name of a check: whose value is the worst."""
+    """Source of the worst value, by name of the check."""
     late_hint: str = ""
     """The dominant cause of missed and late ticks, with its cure; empty if none was."""
     plugin_checks: tuple[CheckResult, ...] = ()
     expectations: tuple[CheckResult, ...] = ()
-    """Those of the scenario that were judged."""
+    """Results of the scenario's expectations that were judged."""
     remarks: tuple[str, ...] = ()
     """Remarks that decide nothing, such as on processors that were refused."""
 

@@ -32,7 +32,7 @@ class ConnectOptions:
     """The operator's decisions about all connections of a command."""
 
     timeout_s: float = 10.0
-    """Until a machine is logged in at; ConnectTimeout of the ssh configuration wins."""
+    """Time until a machine is logged in at; ConnectTimeout of the ssh configuration wins."""
     accept_new_host_keys: bool = False
     """Whether unknown host keys are recorded; changed ones are refused whatever stands here."""
     listed: Mapping[str, Target] = field(default_factory=dict)

@@ -24,7 +24,7 @@ class FailureKind(StrEnum):
     LOST = "lost"
     """The connection broke, or the machine stopped answering, in the midst of it."""
     TIMEOUT = "timeout"
-    """It answers, but did not finish in time."""
+    """The machine answers, but did not finish in time."""
     PYTHON = "python"
     """No Python there, or one that is too old."""
     NO_SUDO = "no_sudo"

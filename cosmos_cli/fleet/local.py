@@ -26,7 +26,7 @@ LOOPBACK = "127.0.0.1"
 ERROR_BYTES_MAX = 4096
 END_TIMEOUT_S = 5.0
 END_POLL_S = 0.25
-"""Between looks whether a command that says nothing has ended."""
+"""Time between looks whether a command that says nothing has ended."""
 READ_BYTES = 262_144
 
 

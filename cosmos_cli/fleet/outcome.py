@@ -13,7 +13,7 @@ from cosmos_cli.fleet.target import Target
 
 T = TypeVar("T")
 HOLD_S = 0.5
-"""So long an outcome waits for those before it."""
+"""Time that an outcome waits for those before it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,7 +21,7 @@ FORKS_DEFAULT = 32
 """A real board keeps the operator waiting while it logs in: with 0.3 s each, 24 take 0.9 s at once and 1.6 s
 with 10 forks. Where the operator's processors are the limit, as with virtual boards, more cost nothing."""
 WAIT_S = 0.25
-"""Between looks at what is done, so that Ctrl-C is heard on every platform."""
+"""Time between looks at what is done, so that Ctrl-C is heard on every platform."""
 
 
 def for_each(

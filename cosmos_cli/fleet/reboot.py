@@ -34,7 +34,7 @@ class Rebooted:
 
     boot_id: str
     back_s: float | None = None
-    """From the order until it answered again; None when it was left alone."""
+    """Time from the order until it answered again; None when it was left alone."""
     why_not: str = ""
 
 
@@ -43,9 +43,9 @@ class Rebooting:
     """Settings of a reboot."""
 
     timeout_s: float
-    """Until each is back."""
+    """Time until each is back."""
     own_boot_id: str
-    """Of this computer, which is never rebooted, under whatever name it stands in the inventory."""
+    """Boot of this computer, which is never rebooted, under whatever name it stands in the inventory."""
     is_forced: bool = False
     """Whether a living run, or another command at work there, is no reason against it."""
     options: ConnectOptions = ConnectOptions()

@@ -25,9 +25,9 @@ class Sending:
 
     name: str
     wire_bytes: float
-    """Of one message, all headers included."""
+    """Size of one message, all headers included."""
     rate_hz: float
-    """Of each sender."""
+    """Messages per second of each sender."""
     within_s: float
     """How long a message may be on its way."""
     senders_max: float = math.inf

@@ -24,7 +24,7 @@ from madns_runtime.plugin.api import Demand
 PACK_AGENTS_MAX = 8
 """Agents of a process that share a deadline, and so a wake-up."""
 SHARE_USABLE = 0.8
-"""Of a processor: above, ticks wait for each other more often than budgets of missed ticks allow."""
+"""Usable share of a processor: above, ticks wait for each other more often than budgets of missed ticks allow."""
 SKB_OVERHEAD_BYTES, SKB_TAIL_BYTES, SKB_HEADER_BYTES = 256, 320, 64
 """Bytes that Linux adds to a datagram that waits in a socket; it rounds up to powers of two."""
 TICK_BYTES = 64
@@ -50,7 +50,7 @@ class ComputerFacts:
     name: str
     processors: int = 1
     speed: float = 1.0
-    """Of one processor, that of the machine of TickCosts being 1."""
+    """Speed of one processor; that of the machine of TickCosts is 1."""
     has_agents: bool = True
     is_host: bool = False
 

@@ -10,7 +10,7 @@ from cosmos_cli.ui.console import Column, Console
 from madns_runtime.lockstep.partition import processors_here
 
 BOARD_PROCESSORS = 4
-"""Of a machine that nobody has asked yet: those of a Raspberry Pi since its second model."""
+"""Processors of a machine that nobody has asked yet: those of a Raspberry Pi since its second model."""
 LIMITS = (Column("limit"), Column("agents at most", is_number=True), Column("why"))
 
 

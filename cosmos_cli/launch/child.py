@@ -56,7 +56,7 @@ class ChildProgram:
     stderr: Path
     run_directory: str
     environment: Mapping[str, str] = field(default_factory=dict)
-    """Beyond that of every program."""
+    """Variables beside those of every program."""
 
 
 class LocalChild:

@@ -18,11 +18,11 @@ from cosmos_cli.launch.run_events import ChildStarted, GroupKilled, GroupSeen, L
 
 HOST = "host"
 TERM_GRACE_S = 3.0
-"""From SIGTERM to SIGKILL."""
+"""Time from SIGTERM to SIGKILL."""
 GROUP_GRACE_S = 5.0
-"""For what a dead child has left in its group: agents and workers end by themselves in this time."""
+"""Time for what a dead child has left in its group: agents and workers end by themselves within it."""
 KILL_WAIT_S = 5.0
-"""For the kernel to carry out a SIGKILL; a process that hangs in a device outlives it."""
+"""Time for the kernel to carry out a SIGKILL; a process that hangs in a device outlives it."""
 GROUP_CHECK_S = 0.1
 
 
@@ -34,11 +34,11 @@ class ChildRecord:
     machine: str | None
     pid: int | None
     doing: str = ""
-    """Its use of the plug-in's code before it can be heard again; empty once that is done."""
+    """What the child does with the plug-in's code before it can be heard again; empty once that is done."""
     has_exited: bool = False
-    """Its leader's end was seen to."""
+    """Whether the end of the group's leader is known."""
     has_ended: bool = False
-    """None of its group lives, or nothing more can be done about it."""
+    """Whether none of its group lives, or nothing more can be done about it."""
     is_killed: bool = False
     group_until_s: float = math.inf
 
@@ -84,7 +84,7 @@ class Children:
 
     @property
     def living(self) -> list[ChildRecord]:
-        """Those of whose group something lives, and may still be ended."""
+        """The children of whose group something lives, and may still be ended."""
         return [child for child in self if not child.has_ended]
 
     @property

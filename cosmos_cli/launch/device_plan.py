@@ -100,11 +100,11 @@ class DevicePlanner:
     labels: AgentLabels = NO_LABELS
     faults: list[tuple[ValuePath, str]] = field(default_factory=list)
     found: dict[str, dict[str, DeviceLaunch]] = field(default_factory=dict)
-    """By machine, by full name."""
+    """Launches of devices, by machine and full name."""
     owners: dict[str, str] = field(default_factory=dict)
     """Owners that the scenario names, by full name of the device."""
     answers: dict[str, KindAnswer] = field(default_factory=dict)
-    """Of kinds, by what they were asked."""
+    """Answers of kinds, by what they were asked."""
 
     def plan(self, fault_at: object = None) -> dict[str, tuple[DeviceLaunch, ...]]:
         """

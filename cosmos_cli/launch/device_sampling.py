@@ -23,7 +23,7 @@ from madns_runtime.config import DeviceLaunch, Timeouts, to_mapping
 
 PROGRAM = (sys.executable, "-P", "-m", "madns_runtime.hardware.sampling")
 END_S = 15.0
-"""Beyond its seconds, for the program to start and for devices to be made safe and closed."""
+"""Time beyond its seconds, for the program to start and for devices to be made safe and closed."""
 USER = "cosmos-devices"
 TALK_SHOWN_MAX = 2000
 

@@ -18,7 +18,7 @@ from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.newest_values import Value, clean_values
 
 NOISE_CHARACTERS_MAX = 500
-"""Of a line that is no event, this much is shown."""
+"""Characters shown of a line that is no event."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class DeviceChanged:
     """A device has another status: never, ok, stale or lost."""
 
     device: str
-    """Its full name, such as pi22/imu."""
+    """Full name of the device, such as pi22/imu."""
     status: str
     why: str = ""
 
@@ -134,7 +134,7 @@ class FaultInserted:
     """A supervisor's answer to the order to insert a fault; *refusal* is empty if it is in force."""
 
     number: int
-    """Of the order."""
+    """Number of the order."""
     refusal: str
 
 

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from cosmos_cli.collect.finish import RunSummary
 
 COLLECTOR_PATIENCE_S = 10.0
-"""For somebody else's command that holds the run at its end."""
+"""Wait for another command that holds the run at its end."""
 OPERATOR_NICE = 5
 """Niceness of the operator: its drawing and collecting can wait; agents on the same processors cannot."""
 
@@ -85,7 +85,7 @@ class RunOptions:
     host: str | None = None
     """The machine that runs the host; None for this computer."""
     is_detached: bool = False
-    """Once it runs, it goes on without its operator."""
+    """Whether the run goes on without its operator, once it runs."""
     forks: int = FORKS_DEFAULT
     connecting: ConnectOptions = ConnectOptions()
 

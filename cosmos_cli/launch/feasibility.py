@@ -24,7 +24,7 @@ DATAGRAM_OVERHEAD_BYTES = OVERHEAD_BYTES + FRAME_BYTES
 IP_UDP_BYTES = 28
 BITS_PER_BYTE = 8
 COUNT_MAX = 2.0**53
-"""Of agents: above, a number and the next one are the same, and nobody has as many."""
+"""The most agents that are computed with: above, a floating-point number and the next are the same."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +48,7 @@ class Inequality:
     """One inequality at the planned number of agents."""
 
     number: str
-    """Of the thesis's equation."""
+    """Number of the equation in the thesis."""
     name: str
     formula: str
     left: float

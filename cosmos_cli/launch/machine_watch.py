@@ -27,7 +27,7 @@ from cosmos_cli.launch.run_events import (
 from madns_runtime.config import Timeouts
 
 REATTACH_INTERVAL_S = 0.2
-"""Between two tries to make a new line to a child."""
+"""Time between two tries to make a new line to a child."""
 PING_INTERVAL_S = 1.0
 SILENCE_S = 2.5
 """Silence after which a process counts as lost."""
@@ -38,12 +38,12 @@ LIFE_LINE_S = 30.0
 UNANSWERED_MAX = 64
 CHECK_INTERVAL_S = 0.25
 LOOK_S_MAX = 2 * CHECK_INTERVAL_S
-"""Of the time between two looks no more counts: an operator that did not look was itself kept from it, and what came
-meanwhile waits to be read."""
+"""The most that counts of the time between two looks: an operator that did not look was itself kept from it, and what
+came meanwhile waits to be read."""
 RETURN_INTERVAL_S = 2.0
-"""Between two tries to reach a lost machine again."""
+"""Time between two tries to reach a lost machine again."""
 RETURN_TRIES_MAX = 2000
-"""More than an hour of them; a longer run has its machine back, or it has none."""
+"""Tries of more than an hour; by then a run has its machine back, or will not get it back."""
 
 
 class Pulse:
@@ -99,18 +99,18 @@ class Pulse:
 
 
 class WatchedTime:
-    """The time in which somebody looked, s."""
+    """The time in which the operator looked for signs of life, s."""
 
     def __init__(self) -> None:
         self._counted_s = 0.0
         self._looked_s = -math.inf
 
     def at(self, now_s: float) -> float:
-        """Return it at a moment after the newest look."""
+        """Return the time watched, at a moment after the newest look."""
         return self._counted_s + min(now_s - self._looked_s, LOOK_S_MAX)
 
     def look(self, now_s: float) -> float:
-        """Return it now, and count from here."""
+        """Return the time watched until now, and count from here."""
         self._counted_s = self.at(now_s)
         self._looked_s = now_s
         return self._counted_s
@@ -119,7 +119,7 @@ class WatchedTime:
 @dataclass(slots=True)
 class _Watched:
     pulses: dict[str, Pulse] = field(default_factory=dict)
-    """By child; the host is one of them."""
+    """Signs of life by child; the host is one of them."""
     cut: set[str] = field(default_factory=set)
     """Children whose line broke."""
     is_asked: bool = False

@@ -42,7 +42,7 @@ PARTS = (
 TIMEOUT_S = 60.0
 ROUND_TRIP_COUNT = 10
 RECORD_BYTES_A_TICK = 256
-"""Of one agent; the shipped simulations record 34 to 116, as README tells."""
+"""Assumed of one agent; the shipped simulations record 34 to 116 (README)."""
 FREE_BYTES_MIN = 64 * 1024**2
 """A run begins on no fuller disk."""
 
@@ -69,7 +69,7 @@ class MachineRehearsal:
     facts: MachineFacts
     has_environment: bool
     files_missing: int
-    """Of the runtime and the scenario; `cosmos run` sends them."""
+    """Files of the runtime and the scenario that are not there yet; `cosmos run` sends them."""
     bytes_missing: int
     living: tuple[str, ...] = ()
     """Runs that live there."""

@@ -53,7 +53,7 @@ RELAY_TALK_BYTES_MAX = 65_536
 NO_STATUS = "ended, and nobody knows how"
 ENDED_CUT = "ended as the connection to it broke"
 SAID_CHARACTERS_MAX = 300
-"""Of a last line that tells why it could not be started."""
+"""Characters shown of a last line that tells why it could not be started."""
 STARTED_ANEW = "it has started anew"
 
 

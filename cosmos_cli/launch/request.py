@@ -114,7 +114,7 @@ class LaunchRequest:
     nice: int = 0
     """Niceness that the operator adds to its own once its children are started."""
     devices: Mapping[str, tuple[DeviceLaunch, ...]] = field(default_factory=dict)
-    """By machine: what it drives."""
+    """Devices that each machine drives, by machine."""
     run_key_hex: str = field(default_factory=lambda: secrets.token_hex(RUN_KEY_BYTES), repr=False)
     session_hex: str = field(default_factory=make_session)
 
@@ -193,7 +193,7 @@ class LaunchOutcome:
     leftovers: tuple[int, ...] = ()
     """Processes that even SIGKILL did not end."""
     is_detached: bool = False
-    """It has not ended: it goes on without its operator."""
+    """Whether the run has not ended, but goes on without its operator."""
 
 
 class View(Protocol):

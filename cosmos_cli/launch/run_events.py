@@ -103,7 +103,7 @@ class GroupKilled:
     name: str
     why: str
     pids: tuple[int, ...]
-    """Its members until then."""
+    """Members of the group until then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +161,7 @@ class FaultOrdered:
     """Somebody wants a fault inserted around a device."""
 
     number: int
-    """Of the order: its answer carries it."""
+    """Number of the order: its answer carries it."""
     target: str
     action: str
     value: float | None

@@ -28,11 +28,11 @@ from cosmos_cli.launch.restarts import Restarts
 from cosmos_cli.launch.run_events import RunEvent
 
 STOP_GRACE_S = 2.0
-"""From the host's end until supervisors are told to stop: agents that follow the host need less."""
+"""Time from the host's end until supervisors are told to stop: agents that follow the host need less."""
 END_MARGIN_S = 5.0
 """A supervisor kills its own late agents and names them; the operator's deadline comes after that."""
 HOST_EXIT_CODES = (0, 1)
-"""Of a host that came to its end: the run was complete, or was not."""
+"""Exit codes of a host that came to its end: the run was complete, or was not."""
 
 
 class Supervision:

@@ -32,4 +32,4 @@ HELPER_PARTS = (
     "apt_words",
     "apt",
 )
-"""Those for `cosmos up`; each is loaded there when it is first needed."""
+"""Parts of the helper for `cosmos up`; each is loaded there when it is first needed."""

@@ -63,9 +63,9 @@ class Cargo:
     runtime: Tree
     scenario: Tree
     needs: Mapping[str, MachineNeeds] = field(default_factory=dict)
-    """Of the devices, by machine."""
+    """Needs of the devices, by machine."""
     drivers: Mapping[str, DriverFiles] = field(default_factory=dict)
-    """Of devices, beside the inventory; by machine."""
+    """Files of devices' drivers beside the inventory, by machine."""
 
     def trees(self, machine: str) -> tuple[Tree, ...]:
         """Return all that a machine is sent."""

@@ -55,7 +55,7 @@ class Locked:
     filename: str
     size_bytes: int = 0
     installed_bytes: int = 0
-    """Of its files, unpacked."""
+    """Bytes of its files, unpacked."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -35,7 +35,7 @@ DISTRIBUTION = "cosmos-madns"
 FILES_MAX = 5_000
 TREE_BYTES_MAX = 256 * 1024 * 1024
 BATCH_BYTES = 4 * 1024 * 1024
-"""Of content a frame; a batch is compressed as one."""
+"""Bytes of content per frame; a batch is compressed as one."""
 COMPRESSION_LEVEL = 6
 ROUNDS_MAX = 3
 """Another operator who assembles the same tree at the same time may take what was just sent."""

@@ -20,9 +20,10 @@ if TYPE_CHECKING:  # what plans is imported while machines are logged in at
 
 COLUMNS = (Column("machine"), Column("board"), Column("result"))
 FAILURE_CHARACTERS_MAX = 600
-"""Of a failure in the table; --json has all of it."""
+"""Characters of a failure in the table; --json has all of it."""
 FAILURE_BEGIN_CHARACTERS = 150
-"""Of one that is longer: which step it was. The end, which is a program's last words and what to do, has the rest."""
+"""Characters from the beginning of one that is longer: which step it was. The end, which is a program's last words and
+what to do, has the rest."""
 
 
 @dataclass(slots=True, kw_only=True)

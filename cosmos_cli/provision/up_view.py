@@ -26,9 +26,9 @@ QUIET_S = 1.0
 REDRAW_INTERVAL_S = 0.2
 TEXT_CHARACTERS_MAX = 100
 STILL_INTERVAL_S = 15.0
-"""Between lines about who is still at work, where nobody looks at a terminal."""
+"""Time between lines about machines still at work, where nobody looks at a terminal."""
 STILL_SHOWN_MAX = 4
-"""Of the things that machines are at, in such a line."""
+"""Tasks that such a line shows."""
 
 
 class MachineTeller:

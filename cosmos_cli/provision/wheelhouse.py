@@ -57,7 +57,7 @@ from cosmos_cli.system.ownership import read_own_file
 from madns_runtime.partial_file import write_whole
 
 SCHEMA = 1
-"""Of what is remembered; what another one wrote is resolved anew."""
+"""Version of what is remembered; what another version wrote is resolved anew."""
 TRUTH_EXTRA = "truth"
 SYSTEM_PREFIX = "python3-"
 FAILURE_KEPT_S = 30.0

@@ -53,7 +53,7 @@ LAST_LINES = 8
 NOTE_BYTES_MAX = 4096
 SCHEME = "file://"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-"""Of a write, which names no file."""
+"""Errors of a write, which names no file."""
 
 
 @contextlib.contextmanager

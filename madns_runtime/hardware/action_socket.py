@@ -29,7 +29,7 @@ SOCKET_NAME: Final = ".actions.sock"
 IN_FORCE_TOLD_MAX: Final = 100
 AGENTS_TOLD_MAX: Final = 20
 IN_FORCE_BYTES_MAX: Final = 65_536
-"""Of all actions in force that are told: a socket takes more at once, by default 160 KiB on a small board."""
+"""Bytes of all actions in force that are told: a socket takes more at once, by default 160 KiB on a small board."""
 WHOLE_RUN: Final = "run"
 """Target of an action that acts on no agents."""
 

@@ -16,7 +16,7 @@ from madns_runtime.errors import MachineError
 from madns_runtime.hardware import messages
 
 LOOK_S: Final = 0.02
-"""Between looks whether a child has ended, where the kernel does not tell."""
+"""Time between looks whether a child has ended, where the kernel does not tell."""
 
 
 def fork_with_pair(run: Callable[[socket.socket], None]) -> tuple[int, socket.socket]:

@@ -25,7 +25,7 @@ from madns_runtime.plugin.context import clean_text
 from madns_runtime.processes import state_directory
 
 WAIT_S: Final = 4.0
-"""For the processes of an earlier supervisor of the same machine to make safe, close and end."""
+"""Time for the processes of an earlier supervisor of the same machine to make safe, close and end."""
 POLL_S: Final = 0.05
 HOLDER_BYTES_MAX: Final = 4096
 FOLDER: Final = "devices"

@@ -28,7 +28,7 @@ from madns_runtime.recording.writer_thread import WriterThread
 
 RECORDS_TIMEOUT_S = 2.0
 ERROR_CHARACTERS_MAX = 500
-"""Of what a driver raised, so much is told; all of it is recorded."""
+"""Characters told of what a driver raised; all of it is recorded."""
 REPORT, GONE = "report", "gone"
 """First words to the manager: [REPORT, counts by device] at the end, in as many messages as it takes; [GONE, why] before where nobody said stop."""
 

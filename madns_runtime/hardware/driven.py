@@ -25,11 +25,11 @@ from madns_runtime.reactor.descriptors import allow_descriptors, ready
 
 NOT_MADE_SAFE: Final = "could not be made safe: its driver failed, look at the device"
 DESCRIPTORS_BESIDE: Final = 256
-"""Of a process that drives devices or looks after them, beside what it has for each."""
+"""Descriptors of a process that drives devices or looks after them, beside those for each."""
 DESCRIPTORS_EACH: Final = CHANNELS_MAX + 16
-"""For one device: a file per channel, and others."""
+"""Descriptors for one device: a file per channel, and others."""
 DESCRIPTORS_PER_USER: Final = 3
-"""For one agent that uses it."""
+"""Descriptors for one agent that uses a device."""
 TELLING: Final = (NOT_FINITE, "received_bytes", "garbage_bytes", "bad_checksums")
 """Ends of the names of counts that tell why there may be no sample: values that are no numbers, bytes that make no frame."""
 

@@ -29,15 +29,15 @@ from madns_runtime.reactor.scheduling import die_with_parent, outlive_parent
 
 GRACE_S: Final = 0.4
 ATTEMPT_S: Final = 5.0
-"""For opening a device anew and making it safe; what takes longer is killed, and tried again."""
+"""Time for opening a device anew and making it safe; what takes longer is killed, and tried again."""
 CLOSE_S: Final = 0.5
 """Then to close it: what is safe stays so, and a close that does not return is no reason to try again."""
 ATTEMPTS_MAX: Final = 3
 RETRY_S: Final = 0.1
 STAND_BY_S: Final = 1.0
-"""From a device's start until a process stands by for it: the start of a run has the processors to itself."""
+"""Time from a device's start until a process stands by for it: the start of a run has the processors to itself."""
 LINGER_S: Final = 20.0
-"""After the supervisor's end: by then every attempt is over."""
+"""Time after the supervisor's end: by then every attempt is over."""
 WATCH, DRIVES, OVER, SAFE = "watch", "drives", "over", "safe"
 """Words: [WATCH, agent, pid], [DRIVES, device, pid] and [OVER] to the guardian, [SAFE, device, how] from it."""
 
@@ -70,12 +70,12 @@ class Guardian:
         self._seats = seats
         self._control = control
         self._drivers: dict[str, int] = {}
-        """By device: process that drives it."""
+        """Process that drives a device, by device."""
         self._attempts: dict[str, int] = {}
         self._helpers: dict[int, tuple[str, socket.socket]] = {}
-        """By process that makes a device safe: the device, and where it says that it is done."""
+        """Device and the socket on which its end is told, by process that makes the device safe."""
         self._standing_by: dict[str, tuple[int, socket.socket]] = {}
-        """By device: the process that stands by for it, and where it is told to go on."""
+        """Process that stands by for a device, and the socket on which it is told to go on, by device."""
         self._retries = 0
         """Attempts that are still to be made."""
         self._has_supervisor = True

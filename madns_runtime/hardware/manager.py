@@ -38,7 +38,7 @@ from madns_runtime.plugin.context import clean_text
 from madns_runtime.reactor.reactor import Reactor
 
 LOOK_PERIOD_S: Final = 0.05
-"""Between two looks at the devices' pages."""
+"""Time between two looks at the devices' pages."""
 STALL_S: Final = 1.0
 STALL_GRACE_S: Final = 0.5
 """Delay of a look after which this process stood still itself, and so may have the devices: they are given a grace, once."""
@@ -46,10 +46,10 @@ OPENING_S: Final = 5.0
 """How long agents wait for devices to be opened, once, before they are started themselves."""
 OPENING_POLL_S: Final = 0.005
 END_S: Final = 3.0
-"""For the devices' processes to end in good order: making safe, and their records."""
+"""Time for the devices' processes to end in good order: to make safe, and to close their records."""
 KILL_WAIT_S: Final = 1.0
 NO_ROOM_S: Final = 0.5
-"""Between two attempts to start a process for which the machine has no room."""
+"""Time between two attempts to start a process for which the machine has no room."""
 
 Emit = Callable[[Mapping[str, Any]], None]
 

@@ -22,7 +22,7 @@ from madns_runtime.plain_values import is_real
 
 SOCKET_NAME: Final = ".orders.sock"
 LINE_BYTES_MAX: Final = 65_536
-"""Of an order: the longest text that an action takes fits in several times."""
+"""Bytes of an order: the longest text that an action takes fits in several times."""
 CLIENTS_MAX: Final = 8
 """With one more, the connection of the client that has waited longest is closed."""
 

@@ -13,7 +13,7 @@ from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.messages import AgentFault
 
 RESTART_DELAY_S: Final = 0.2
-"""From the loss of an agent that agents.restarts_max gives another start to its return, s of simulated time."""
+"""Simulated time from the loss of an agent that agents.restarts_max gives another start to its return."""
 TIME_EPSILON_S: Final = 1e-9
 
 

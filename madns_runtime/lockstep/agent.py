@@ -46,7 +46,7 @@ class WorkerCore:
     program: RoleProgram
     clock: SimulatedClock
     devices: tuple[DeviceLaunch, ...] = ()
-    """Those of all agents."""
+    """Devices of all agents."""
     outbox: list[Sent] = field(default_factory=list)
     """Messages sent since the last answer to the host, in order."""
 

@@ -14,7 +14,7 @@ class Assignment:
 
     config: RunConfig
     devices: tuple[DeviceLaunch, ...]
-    """Those of all agents."""
+    """Devices of all agents."""
     directory: Path
     """The run directory."""
     agents: range

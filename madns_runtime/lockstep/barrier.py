@@ -24,7 +24,7 @@ from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.timing.granted_clock import GrantedLimit, is_stopped
 
 PROGRESS_INTERVAL_S = 0.5
-"""Between two reports to the operator, and two looks for who is late."""
+"""Time between two reports to the operator, and between two looks for a worker that is late."""
 SERVE_INTERVAL_S = 0.2
 """A host that is busy with its own half hears the operator this often."""
 SERVE_WAIT_S = 0.001

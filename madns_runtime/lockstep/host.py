@@ -48,9 +48,9 @@ from madns_runtime.timing.clock import utc_now_iso
 from madns_runtime.timing.rate import count_ticks
 
 HANG_GRACE_S = 2.0
-"""Beyond twice the time for shutdown: a host that hangs, without an operator, ends by force."""
+"""Time beyond twice that for shutdown: a host that hangs, without an operator, ends by force."""
 SERVICES = tuple(Service)
-"""By number."""
+"""Classes of service by number."""
 DRAIN_ROUNDS_MAX = 16
 """Answers to answers that are handed out after the last tick."""
 

@@ -36,7 +36,7 @@ from madns_runtime.recording.run_journal import RunJournal
 BEST: Final = Service.BEST
 QUEUE_BYTES_MAX: Final = LinkLimits().send_queue_bytes_max
 LARGEST_BYTES: Final = min(QUEUE_BYTES_MAX, MESSAGE_BYTES_MAX)
-"""Of one message, as between machines."""
+"""Bytes of one message, as between machines."""
 
 
 def encode(message: Any, service: Service) -> bytes:

@@ -12,7 +12,7 @@ from madns_runtime.medium.outcomes import between_agents
 from madns_runtime.recording.newest_values import Value, told_columns
 
 SERVICES: Final = ("best", "reliable", "sync")
-"""By the number of the class of service."""
+"""Names of the classes of service, by number."""
 LOST: Final = "lost"
 """State of an agent that no worker runs."""
 
@@ -34,14 +34,14 @@ class AgentAccount:
     """Messages to the host, by class of service."""
     down: list[int] = field(default_factory=lambda: [0] * len(SERVICES))
     too_late: int = 0
-    """Of those, sent when nobody was to receive any more."""
+    """Messages of those that were sent when nobody was to receive any more."""
     not_sent: int = 0
     """Messages of the host's half that had nobody to go to."""
     deadlines_broken: int = 0
     peer_messages: Mapping[str, int] = field(default_factory=dict)
     """Its counts of messages between agents."""
     peer_messages_before: dict[str, int] = field(default_factory=dict)
-    """The same of incarnations that were lost."""
+    """The same counts of incarnations that were lost."""
     columns: list[Value] | None = None
     """The newest values of its columns; None before any were told."""
     state: str = "starting"

@@ -18,7 +18,7 @@ from madns_runtime.lockstep.worker_line import HostGone, WorkerLine
 from madns_runtime.reactor.forking import CAME_BACK, ForkedCopies, end_child
 
 WAIT_S = 1.0
-"""So long the end of a run waits for processes that a plug-in forked and that may come back yet."""
+"""Time that the end of a run waits for processes that a plug-in forked and that may come back yet."""
 
 
 class StrayForks:

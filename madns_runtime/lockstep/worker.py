@@ -42,7 +42,7 @@ from madns_runtime.recording.newest_values import Value
 from madns_runtime.timeline.fault_kinds import KILL
 
 HANG_GRACE_S = 2.0
-"""Beyond the time for shutdown: a worker that hangs in a plug-in ends by force when its host is gone."""
+"""Time beyond that for shutdown: a worker that hangs in a plug-in ends by force when its host is gone."""
 STACK_SIGNAL = signal.SIGUSR1
 """Makes a worker write where it is to standard error."""
 TERMINATED = "its process was ended by SIGTERM"

@@ -26,11 +26,11 @@ from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.timing.granted_clock import GrantedClock, GrantedLimit
 
 STACK_WAIT_S = 0.3
-"""For a worker that hangs to write where it is."""
+"""Time for a worker that hangs to write where it is, without its waits for a processor."""
 STACK_WAIT_S_MAX = 10.0
-"""The same, beside its waits for a processor."""
+"""The same with its waits for a processor."""
 EXIT_WAIT_S = 2.0
-"""From the end of a worker's line to the end of its process, beyond its waits for a processor."""
+"""Time from the end of a worker's line to the end of its process, without its waits for a processor."""
 CHECK_S = 0.01
 SEND_CHECK_S = 0.25
 """While a worker takes nothing, whether its time is over is looked at this often."""
@@ -42,7 +42,7 @@ class WorkerProcess:
     """One worker."""
 
     agents: list[int]
-    """Those it runs, and lost ones that would return to it, by index, in order."""
+    """Indices of the agents that it runs, and of lost ones that would return to it, in order."""
     pid: int
     line: socket.socket
     position: memoryview

@@ -32,7 +32,7 @@ from madns_runtime.protocol.messages import Delivery, Transmission, Transmission
 LEAD_S: Final = 1.0
 """Lead of the hand-over before the arrival, s: far more than a network takes."""
 OUTCOMES_MAX: Final = 65_536
-"""Of one message; more is a fault of the medium."""
+"""Outcomes of one message; more is a fault of the medium."""
 KEPT_MAX: Final = 2**20
 """Messages on their way that are kept at a time; further ones are not delivered, and counted."""
 

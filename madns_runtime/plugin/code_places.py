@@ -14,9 +14,9 @@ from madns_runtime.bounded_files import read_regular_file
 from madns_runtime.plugin import time_limit
 
 CODE_BYTES_MAX = 16 * 1024 * 1024
-"""Of a file of Python: no text that somebody wrote is longer."""
+"""Bytes of a file of Python: no text that somebody wrote is longer."""
 MODULE_PREFIX = "madns_plugin_"
-"""Of the names under which files are loaded."""
+"""Prefix of the names under which files are loaded."""
 
 
 def place_of(thing: Any) -> str:

@@ -35,9 +35,9 @@ from madns_runtime.recording.stream_rules import check_agent_name, check_name
 FRAMEWORK = Path(__file__).parents[1]
 """Where code stands that is nobody's plug-in, but for what is shipped below simulations."""
 TEXT_CHARACTERS_MAX = 2000
-"""Of what a plug-in's exception says; the whole is in the log."""
+"""Characters kept of what a plug-in's exception says; the whole is in the log."""
 LINE_CHARACTERS_MAX = 1500
-"""Of the first line of that: with the call and the place it is no longer than a text may be."""
+"""Characters kept of the first line of that: with the call and the place it is no longer than a text may be."""
 
 
 class Sender(Protocol):

@@ -33,12 +33,12 @@ except ImportError as error:
 T = TypeVar("T")
 
 CONNECT_S = 20.0
-"""For the scheduler to answer, and again for the workers: all within timeouts.host_start_s."""
+"""Time for the scheduler to answer, and again for the workers: all within timeouts.host_start_s."""
 CONNECT_CHECK_S = 0.5
 CONNECT_ATTEMPTS = 8
-"""Of which one fails where the scheduler tells all its clients something at the moment at which it greets this one."""
+"""Attempts to connect; one fails where the scheduler tells all its clients something just as it greets this one."""
 CLOSE_S = 3.0
-"""For saying goodbye; after that connections are dropped, and processes of our own killed."""
+"""Time to close in good order; after that connections are dropped, and processes of our own killed."""
 
 
 class ClosingClient(Client):  # type: ignore[misc]  # distributed has no types

@@ -20,7 +20,7 @@ class ChannelReading(NamedTuple):
     number: int
     """How many samples the channel has had: the same number is the same sample."""
     status: DeviceStatus
-    """Of the device."""
+    """Status of the device."""
     device_s: float
     """Time at which it was taken on the device's own clock, s; not a number if it has none."""
 

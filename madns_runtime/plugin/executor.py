@@ -33,7 +33,7 @@ JOBS_MAX = 10_000
 """Jobs submitted and not yet taken back."""
 WORKER_DIED = "a worker of the executor has died: was it killed, or is memory short?"
 START_TIMEOUT_S = 30.0
-"""For the workers of a pool of our own to be there; waits for a processor do not count."""
+"""Time for the workers of a pool of our own to be there; waits for a processor do not count."""
 START_CHECK_S = 0.5
 
 

@@ -39,9 +39,9 @@ STAND_S: Final = 1e-6
 REPEATS_MAX: Final = 100_000
 """Calls of the timer, or jobs, at one simulated time; more means that the half never lets time go on."""
 READY_SHARE = 0.8
-"""Of timeouts.host_start_s, or timeouts.agents_ready_s, for loading."""
+"""Share of timeouts.host_start_s, or timeouts.agents_ready_s, for loading."""
 LEFT_SHARE = 0.1
-"""Of that: a process that needed nearly all its time to start is still given so much to load."""
+"""Share of that which a process still gets to load when it needed nearly all its time to start."""
 
 
 class HalfFailed(PluginError):

@@ -26,7 +26,7 @@ LONG_CALL_S: Final = 0.010
 STANDSTILL_S: Final = 0.5
 """One that takes this long is told at once: agents lose a silent host."""
 SWEPT_AFTER_S: Final = 86_400.0
-"""So long a page of a host that has ended is left for whoever started it: longer than most runs."""
+"""Time that a page of a host that has ended is left for whoever started it: longer than most runs."""
 FOLDER: Final = Path("/dev/shm")
 PREFIX: Final = "madns-host-"
 WHAT_BYTES: Final = 120
@@ -37,7 +37,7 @@ RETURNED: Final = ord(" ")
 """Stands in the place of the mark once the call has returned."""
 LAST: Final = "finish"
 FORKS_WAIT_S: Final = 1.0
-"""So long the last call waits for processes that the half forked and that may come back yet."""
+"""Time that the last call waits for processes that the half forked and that may come back yet."""
 
 
 def page_path(session_hex: str) -> Path:
@@ -55,7 +55,7 @@ class HostCalls:
 
     def __init__(self, session_hex: str = "") -> None:
         self.name = ""
-        """Of the half: what precedes a method's name."""
+        """Name of the half, which precedes a method's name."""
         self.t_s: Callable[[], float | None] = lambda: None
         """Returns the simulated time, s; None before it runs."""
         self.is_counting = False

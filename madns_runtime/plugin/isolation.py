@@ -17,7 +17,7 @@ from madns_runtime.plugin.code_places import blame, error_text
 from madns_runtime.plugin.time_limit import PluginStopped, hold
 
 ITEMS_MAX = 1_000_000
-"""Of an answer: what has no end would fill the memory before its time is over."""
+"""Items of an answer: what has no end would fill the memory before its time is over."""
 EXTRA_OF_MODULE = {
     "pyarrow": "host",
     "scipy": "host",

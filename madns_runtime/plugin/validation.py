@@ -132,4 +132,4 @@ HOST_CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {
 }
 """Checks of what methods of a host's half return, by method; values of other methods are not looked at."""
 AGENT_CHECKS: Final[Mapping[str, Callable[[Any], Any]]] = {"finish": agent_summary}
-"""Those of an agent's half."""
+"""Checks of what an agent's half returns, by method."""

@@ -34,7 +34,7 @@ from madns_runtime.timing.clocksync import ClockEstimate
 
 PING_INTERVAL_FIRST_S = 0.02
 REPORT_INTERVAL_S = 0.9
-"""So often a ping tells how the agent fares; making that up costs more than the exchange of times."""
+"""Time between two pings that tell how the agent fares; making that up costs more than the exchange of times."""
 PINGS_FIRST = 12
 """The first exchanges follow closely, so that a clock estimate stands before T0."""
 CLOCK_ERROR_S_MAX = 0.02
@@ -118,7 +118,7 @@ class AgentSession:
             now_s + timeouts.agents_ready_s + timeouts.host_setup_s + timeouts.agent_setup_s
         )
         self._ready_due_s: float | None = None
-        """Until when readiness waits for the clock; None while it does not wait."""
+        """Time until which readiness waits for the clock; None while it does not wait."""
         self._t0_host_s = -math.inf
         """Simulated time zero on the host's clock."""
         self._started_s = now_s

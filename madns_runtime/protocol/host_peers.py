@@ -51,9 +51,9 @@ class Peer:
     link: Link | None = None
     address: Address | None = None
     pid: int | None = None
-    """Of the process that said hello; None until it did."""
+    """Process that said hello; None until one did."""
     incarnations_seen: set[int] = field(default_factory=set)
-    """Of all processes that spoke for it; the link's is the present one."""
+    """Incarnations of all processes that spoke for the agent; the link's is the present one."""
     heard_s: float = 0.0
     pings: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=PINGS_MAX))
     """Pings not answered yet: the agent's time, and when it came. Older ones give way: they would tell less of its clock."""

@@ -12,7 +12,7 @@ from madns_runtime.protocol.datagram import (
 )
 
 PLUGIN_CHANNEL = 1
-"""Of BEST messages: the framework's own go by channel 0, so that neither pushes the other out."""
+"""Channel of plug-ins' BEST messages: the framework's own go by channel 0, so that neither pushes the other out."""
 
 
 class SendQueueFull(MadnsError):

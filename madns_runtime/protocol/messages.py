@@ -180,7 +180,7 @@ class FaultOrder:
     number: int
     """The order's."""
     device: str
-    """Its full name, such as pi22/imu."""
+    """Full name of the device, such as pi22/imu."""
     action: str
     value: float
     """Not a number for an action without one."""

@@ -31,7 +31,7 @@ REPLAY_WINDOW_PACKETS: Final = 1024
 """A packet that is older than the newest by this many cannot be told from a repeat."""
 ACK_BITS: Final = 64
 ELICITING_PACKETS_MAX: Final = 2
-"""So many packets that want an acknowledgement get one at once."""
+"""Packets that want an acknowledgement: after so many it is sent at once."""
 SENT_TIMES: Final = 256
 """An acknowledgement of a packet that is older than the newest by this many gives no round trip."""
 
@@ -151,7 +151,7 @@ class Packets:
         self.are_awaited = False
         """Whether a stream waits for acknowledgements of packets."""
         self.measure_due_s = -_NEVER
-        """From when on a round trip is measured even if no stream needs it."""
+        """Time from which on a round trip is measured even if no stream needs it."""
         self.round_trip = RoundTrip()
 
     @property

@@ -9,7 +9,7 @@ PING_INTERVAL_S = 0.25
 PINGS_PER_SILENCE = 2.5
 """Pings come so often at least in the time after which an agent that says nothing is lost."""
 PING_SLACK_S_MAX = 0.1
-"""For so long at most a ping waits for a tick's wake-up."""
+"""The longest that a ping waits for a tick's wake-up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

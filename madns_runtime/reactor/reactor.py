@@ -33,7 +33,7 @@ CALLS_BATCH_MAX = 64
 CALLS_MAX = 100_000
 """Calls from other threads that may wait; more means that the loop hangs."""
 SLEEPS_KEPT = 32
-"""So many last waits are known one by one."""
+"""Last waits that are kept one by one."""
 WAKE_BYTES = (1).to_bytes(8, sys.byteorder)
 """Bytes that an eventfd takes; a pipe does not mind."""
 
@@ -231,7 +231,7 @@ class Reactor:
             os.close(fd)
 
     def end_if_forked(self) -> None:
-        """As `end_if_stray`, often and without a system call; a fork that Python did not do is found by that alone."""
+        """Do as `end_if_stray`, often and without a system call; a fork that Python did not do is found by that alone."""
         if generation() != self._generation:
             self.end_if_stray()
 

@@ -27,7 +27,7 @@ KEPT_BYTES_MAX = 4 * 1024 * 1024
 """Events that the operator has not told to have seen; the oldest of more are dropped and counted."""
 ATTACH_LINE_BYTES_MAX = 4096
 ATTACH_LINE_S = 5.0
-"""From a connection to its first line."""
+"""Time from a connection to its first line."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +40,7 @@ class Reattachment:
     """The run's."""
     incarnation: int = 1
     wait_s: float
-    """From the end of its line until it is gone."""
+    """Time from the end of the operator's line until it counts as gone."""
 
 
 def way_back_of(launch: Launch, directory: Path, incarnation: int = 1) -> Reattachment | None:

@@ -26,9 +26,9 @@ from madns_runtime.realtime.packs import Pack, phase_of, split_into_packs
 from madns_runtime.realtime.process_port import ProcessPort
 
 ABANDON_S = 5
-"""For an agent that a fault ends with its process to let go of what outlives it, at most."""
+"""Time for an agent that a fault ends with its process to let go of what outlives it."""
 HANG_GRACE_S = 2.0
-"""Beyond the time for shutdown: an agent that hangs in its plug-in ends itself, and leaves its stack."""
+"""Time beyond that for shutdown: an agent that hangs in its plug-in ends itself, and leaves its stack."""
 
 
 class AgentProcess:
@@ -64,7 +64,7 @@ class AgentProcess:
         self._dropped: dict[str, float | None] = {}
         """Agents that a fault is ending, with the time until their return, s."""
         self._away: set[str] = set()
-        """Those of them that have ended and will return."""
+        """Agents that a fault has ended and that will return."""
         self._packs: dict[str, Pack] = {}
         self._incarnations: dict[str, int] = {}
         self._counted: dict[str, dict[int, int]] = {}

@@ -17,7 +17,7 @@ from madns_runtime.realtime.ticks import PacedTicks
 from madns_runtime.recording.newest_values import NewestValues
 
 REPORT_BYTES_MAX: Final = BEST_BYTES_MAX - 32
-"""Of the entries of a report: the rest of a ping is its time and a few heads."""
+"""Bytes of the entries of a report: the rest of a ping is its time and a few heads."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,12 +25,12 @@ class AgentOutcome:
     """End of an agent: how and why."""
 
     as_ordered: bool
-    """By the host's order at the end of a run."""
+    """Whether it ended by the host's order at the end of a run."""
     reason: str = ""
     may_restart: bool = False
-    """It failed by itself while the run may go on: another try makes sense."""
+    """Whether it failed by itself while the run may go on: another try makes sense."""
     is_run_over: bool = False
-    """It was ended with the run: nobody is to return to that any more."""
+    """Whether it was ended with the run: nobody is to return to that any more."""
 
 
 @dataclass(slots=True, kw_only=True)

@@ -59,7 +59,7 @@ PROGRESS_INTERVAL_S = 0.5
 HANG_UP_WAIT_S = 0.5
 """On a busy computer, from the end of a dead operator's line to an agent until the end of that to the host."""
 HANG_GRACE_S = 2.0
-"""Beyond the time for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
+"""Time beyond that for shutdown: a loop that hangs in a plug-in, without an operator, ends by force."""
 
 
 class HostRuntime:

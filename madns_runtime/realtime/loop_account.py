@@ -79,7 +79,7 @@ class _Looked(NamedTuple):
     filled_s: Mapping[Cause, float]
     """How much of the window each cause filled, but for steps, s."""
     steps: Mapping[int, _Steps]
-    """By agent."""
+    """Steps by agent."""
     together_s: float
     """How much of the window all of them filled: a collection within a step counts once, s."""
 

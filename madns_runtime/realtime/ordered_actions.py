@@ -64,7 +64,7 @@ class OrderedActions(AgentActions):
         self._stress: dict[int, tuple[subprocess.Popen[bytes], ...]] = {}
         self._ended: list[subprocess.Popen[bytes]] = []
         self._drifts: dict[int, float] = {}
-        """By number those of the clock that this agent takes part in, 1e-6."""
+        """Drifts of the clock that this agent takes part in, 1e-6, by number of the action."""
         own: Mapping[str, OwnAction] = {
             STOP.word: lambda order: self._end_at(order.t_s),
             STRESS.word: self._load,

@@ -14,7 +14,7 @@ from madns_runtime.timing.clocksync import ClockEstimate
 CLOCK_INTERVAL_S = 1.0
 """The clock's estimate is recorded this often, though it changes with every exchange."""
 PROBLEM_CHARACTERS_MAX = 200
-"""Of the disk's trouble in a report, which must fit a datagram."""
+"""Characters of the disk's trouble in a report, which must fit a datagram."""
 
 
 class ProcessRecords:

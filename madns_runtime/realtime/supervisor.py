@@ -39,7 +39,7 @@ from madns_runtime.realtime.agent_report import AgentOutcome, how_ended, make_re
 
 RESTART_DELAY_S = 0.2
 KILL_GRACE_S = 3.0
-"""Beyond the time for shutdown: one that cannot even do that is killed."""
+"""Time beyond that for shutdown: a process that cannot even do that is killed."""
 KILL_WAIT_S = 2.0
 FLUSH_TIMEOUT_S = 2.0
 REASON_BYTES_MAX = 2048

@@ -17,7 +17,7 @@ from madns_runtime.realtime.host_core import RealtimeCore
 ANSWER_S: Final = 5.0
 """An agent that has not answered an order by then is not waited for."""
 LOOK_PERIOD_S: Final = 0.1
-"""Between two looks at the agents' pings, while an order waits for its answer."""
+"""Time between two looks at the agents' pings, while an order waits for its answer."""
 SHOWN_MAX: Final = 20
 TEXT_CHARACTERS_MAX: Final = 500
 

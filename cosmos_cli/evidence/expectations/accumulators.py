@@ -237,7 +237,7 @@ class FirstTime(Accumulator):
         self._when = when
         self._first_s: float | None = None
         self.place: int | None = None
-        """Of its record."""
+        """Place of its record."""
 
     def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         held = np.flatnonzero(holds(self._when, values))

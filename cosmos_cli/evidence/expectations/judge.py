@@ -51,9 +51,9 @@ class JudgedExpectations:
     """Results of a run's expectations."""
 
     results: tuple[CheckResult, ...] = ()
-    """Of those that were judged, in their order."""
+    """Results of the expectations that were judged, in their order."""
     not_judged: Mapping[str, str] = field(default_factory=dict)
-    """By name of the others: why."""
+    """Why the others were not judged, by name."""
     unseen: tuple[str, ...] = ()
     """Remarks on words that are looked for and that no record has, where any may come: they may be misspelt."""
     of_strangers: tuple[str, ...] = ()
@@ -171,7 +171,7 @@ class _Followed:
         self._agents = frozenset(self._names)
         self._records = source.records_of(expectation.stream)
         self._end_s = min(duration_s, duration_s if expectation.to_s is None else expectation.to_s)
-        """Of the stretch of time that a rate is of, s."""
+        """End of the stretch of time that a rate is of, s."""
         self._has_stream = bool(source.tables_of(expectation.stream))
         recorded = source.unit_of(expectation.stream, expectation.field)
         factor = conversion(expectation.unit, recorded) if expectation.unit else 1.0

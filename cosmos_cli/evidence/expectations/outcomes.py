@@ -15,7 +15,7 @@ from madns_runtime.written_times import later_s
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExpectationOutcome:
-    """Of one agent."""
+    """Outcome of an expectation at one agent."""
 
     got: float | None
     """None where there is none: it never came, or is not finite."""
@@ -23,7 +23,7 @@ class ExpectationOutcome:
     """Simulated time of it, s."""
     passed: bool
     place: int | None = None
-    """Of its record, where others may come after it."""
+    """Place of its record, where others may come after it."""
     why: str = ""
     """Why there is none, if that is known."""
 

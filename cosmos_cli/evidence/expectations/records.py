@@ -39,9 +39,9 @@ class Batch:
     t_s: Floats
     columns: Mapping[str, NDArray[Any]]
     values: NDArray[Any]
-    """Of the field that was chosen; else empty."""
+    """Values of the field that was chosen; else empty."""
     places: Places
-    """Of the records, among all of whoever recorded them."""
+    """Places of the records among all of whoever recorded them."""
     has_begun: Flags
     """Whether simulated time ran when each was recorded; those of before count as time 0."""
 

@@ -17,7 +17,7 @@ KEPT_MAX: Final = 1000
 """Different words that are kept of one stream; of more, such as sentences, the first."""
 TOLD_MAX: Final = 10
 CHARACTERS_MAX: Final = 40
-"""Of a word that is told."""
+"""Characters of a word that are shown."""
 
 
 class SeenWords:

@@ -18,7 +18,7 @@ KEPT_MAX: Final = 1000
 TOLD_MAX: Final = 5
 """Names, and expectations, that a remark tells."""
 CHARACTERS_MAX: Final = 40
-"""Of a name that is told."""
+"""Characters of a name that are shown."""
 
 
 class Strangers:

@@ -30,9 +30,9 @@ from cosmos_cli.fleet.transfer_limits import Patience, duration_words
 
 READ_BYTES = 262_144
 HEADER_BYTES_MAX = 8 * 1024 * 1024
-"""Of one line of JSON. The largest that is meant, many contents of files for --diff, is far smaller."""
+"""Bytes of one line of JSON. The largest that is meant, many contents of files for --diff, is far smaller."""
 VALUES_MAX = 500_000
-"""Of one line: every value takes some hundred times its bytes here."""
+"""Values of one line: each takes some hundred times its bytes here."""
 SAID_BYTES_MAX = 60
 TALKS_ADVICE = (
     "a shell start-up file there (.bashrc, .profile, .ssh/rc) that prints in sessions that are not interactive"
@@ -49,7 +49,7 @@ class ExpectedAnswer:
     """Shape and bounds of an answer."""
 
     shape: Shape
-    """Of its value; of one that streams, of the value of each part."""
+    """Shape of the answer's value; of one that streams, of the value of each part."""
     what: str
     """The question, for messages."""
     is_streamed: bool = False

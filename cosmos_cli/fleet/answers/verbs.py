@@ -46,9 +46,9 @@ from cosmos_cli.fleet.answers.shapes import (
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 
 PIECE_BYTES_MAX = 1024 * 1024
-"""Of a file's content in one frame."""
+"""Bytes of a file's content in one frame."""
 BODY_BYTES_MAX: Mapping[str, int] = {"fetch": PIECE_BYTES_MAX, "sample_devices": PIECE_BYTES_MAX}
-"""By verb; the answers of all others have no body."""
+"""Bytes of an answer's body, by verb; the answers of all others have none."""
 LAST_WORDS_CHARACTERS_MAX = 8192
 ADVICE_CHARACTERS_MAX = 2000
 
