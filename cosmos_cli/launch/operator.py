@@ -1,8 +1,8 @@
 """
 The operator's side of a run: one loop that tells the supervision what happens, and carries out what it decides.
 
-What is decided stands in `Supervision`; here are the descriptors, processes, threads and the clock. Of a
-detached run the operator leaves everything once it is under way.
+`Supervision` decides; here are the descriptors, processes, threads and the clock. The operator of a detached run
+leaves once the run is under way.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from madns_runtime.timing.granted_clock import GrantedClock
 HOST_MODULE = "madns_runtime.host"
 AGENT_MODULE = "madns_runtime.agent"
 LOCKSTEP_ENVIRONMENT: Mapping[str, str] = {"PYTHONHASHSEED": "0"}
-"""The order of a set of names depends on it: with it, that is the same in every run."""
+"""With it the order of a set of names is the same in every run."""
 STALL_S = 5.0
 """A turn of the loop that took this long means that the operator was stopped (Ctrl-Z), not its children."""
 STOOD_STILL = (
@@ -49,15 +49,15 @@ STOOD_STILL = (
     " timeouts.silence_s is lost: keep it awake, or let a board have the run (--detach --host MACHINE)"
 )
 SELECT_MAX_S = 1.0
-"""A wake-up lost to a bug costs this long, not the run."""
+"""Longest wait of the loop: a wake-up lost to a bug costs this long, not the run."""
 SELECT_MIN_S = 0.005  # while what is nearly due waits for a clock that stands
 PUSH_INTERVAL_S = 0.02
 """While a line to another machine is full, it is tried again this often."""
 BACKGROUND_END_S = 10.0
-"""For what machines are still being asked when the run is over."""
+"""Time for questions to machines that are under way when the run is over."""
 CLEAN_S = 3.0
 FORCED_S = 3.0
-"""For what a lost machine's earlier incarnation has left there."""
+"""Times for what a lost machine's earlier incarnation has left there: to end cleanly, then by force."""
 NO_MACHINES: Mapping[str, RemoteMachine] = {}
 
 _boot_s = partial(time.clock_gettime, getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))

@@ -1,10 +1,9 @@
 """
-`cosmos up`: on one machine facts, plan, steps, check; on a fleet, what its machines have in common as well.
+`cosmos up`: gathers facts of a machine, plans steps, carries them out and checks the result; for a fleet, on all machines.
 
-One connection per machine; without a change, one question.
-
-The first look takes no lock and changes nothing. Where something must change the lock is taken, and the
-facts are asked for again, as another command may have worked there meanwhile.
+One connection per machine, and where nothing is to change, one question. The first look takes no lock and changes
+nothing. Where something must change the lock is taken, and the facts are asked for again: another command may have
+worked there meanwhile.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ if TYPE_CHECKING:
     from cosmos_cli.models.loading import ScenarioFile
 
 LOCK_WAIT_S = 10.0
-"""For another command to end there: one that was cut off gives the lock up within moments."""
+"""Wait for another command to end there: one that was cut off gives the lock up within moments."""
 LOCK_RETRY_S = 0.5
 LOGIN_TIMEOUT_S = 10.0
 CHECK_TITLE = "runtime starts, and UDP comes and goes"
@@ -64,9 +63,9 @@ class UpOptions:
     """Options of `cosmos up`."""
 
     is_check: bool = False
-    """Show the plan and change nothing."""
+    """Whether the plan is shown and nothing changed."""
     has_texts: bool = False
-    """Contents of files are wanted, for --diff."""
+    """Whether contents of files are wanted, for --diff."""
     host: str | None = None
     """The machine that will run the host's half; None for this computer."""
 
@@ -233,7 +232,7 @@ class MachineUp:
         return others
 
     def _raise_first(self, answers: Sequence[Answer], udp: dict[str, Any]) -> None:
-        """Raise for a check that failed; say of datagrams that came but were not answered there, that it is so."""
+        """Raise for a check that failed; where datagrams came from there and the answers did not arrive, say so."""
         try:
             raise_first(answers)
         except MachineFailure as failure:
@@ -309,7 +308,7 @@ class FleetUp:
         )
 
     def warn(self, remark: str) -> None:
-        """Show what is worth a word before any machine is worked on."""
+        """Show a warning before any machine is worked on."""
         self._view.say(f"warning: {remark}")
 
     def bring(self, connection: Connection, helper: Helper) -> MachineResult:

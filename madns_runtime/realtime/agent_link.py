@@ -1,4 +1,4 @@
-"""An agent's way to the host: its share of the process's socket, its session, and the simulated time that the session knows."""
+"""An agent's link to the host: its share of the process's socket, its session, and simulated time as that knows it."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class AgentPort:
             name,
             config.conditions,
             tick_hz=config.agents.tick_hz,
-            now_s=self.now_s,  # of one that returns the present time, in its set-up as well
+            now_s=self.now_s,  # the present time also in the set-up of an agent that returns
             report=self._condition_met,
             counted=counted,
         )
@@ -92,7 +92,7 @@ class AgentPort:
         self.t0_host_s: float | None = None
         """Simulated time zero on the host's clock; None before it is known."""
         self._rejoined_at_s: float | None = None
-        """Simulated time zero on this machine's clock, as one that rejoins knows it while it sets up."""
+        """Simulated time zero on this machine's clock, as an agent that rejoins knows it while it sets up."""
         self.must_flush = False
         """Whether something waits to be sent."""
         self._lead_s = config.timeouts.start_lead_s

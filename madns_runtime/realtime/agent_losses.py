@@ -42,7 +42,7 @@ class AgentLosses:
         self._reasons: dict[str, str] = {}
 
     def moved(self, event: AgentMoved) -> None:
-        """Tell the new phase of an agent; of a loss that was ordered, that it was, as in lockstep."""
+        """Announce the new phase of an agent; a loss that was ordered is announced as such, as in lockstep."""
         is_intended = event.phase is Phase.LOST and self._faults.intended.is_coming(event.agent)
         self._announced.agent_moved(event, is_intended=is_intended)
 
@@ -50,9 +50,8 @@ class AgentLosses:
         """Note a loss, and tell the half of it if that can take it."""
         agent, reason = loss.agent, loss.reason
         if (why := self._faults.lost(agent, loss.incarnation)) is not None:
-            reason = (
-                why  # as in lockstep, whether its process was its own and was killed, or goes on
-            )
+            # As in lockstep, whether its process was its own and was killed, or goes on.
+            reason = why
             self._report.intended_lost[agent] = reason
             self._announced.log("warning", f"{agent} is lost on purpose: {reason}")
         else:

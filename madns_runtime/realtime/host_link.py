@@ -1,4 +1,4 @@
-"""The host's way to its agents: its socket, its session, and the simulated time that it has given out."""
+"""The host's link to its agents: its socket, its session, and the simulated time that it has given out."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class HostPort:
         on_due: Called when the session's timer is due.
 
     Raises:
-        MachineError: The port is taken, say.
+        MachineError: The socket cannot be opened, as where its port is taken.
     """
 
     def __init__(self, launch: HostLaunch, *, reactor: Reactor, on_due: Callable[[], None]) -> None:
