@@ -80,7 +80,9 @@ class Layered:
         keys = LinkKeys(up=b"u" * 32, down=b"d" * 32)
         self._seal = None
         if "seal" in layers:
-            self._seal = Seal(keys, role, session=b"starstar", agent_index=agent, incarnation=agent)
+            self._seal = Seal(
+                keys, role, session=b"starstar", agent_index=agent, incarnation_id=agent
+            )
         self._pack, self._unpack = msgpack.Packer().pack, msgpack.unpackb
 
     def write(self, number: int) -> bytes:

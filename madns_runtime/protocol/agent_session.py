@@ -54,11 +54,11 @@ _RUNNING = AgentState.RUN_SIMULATION
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentIdentity:
-    """Identity of an agent on the wire; *incarnation* is random, new at every start."""
+    """Identity of an agent on the wire; *incarnation_id* is random, new at every start."""
 
     name: str
     index: int
-    incarnation: int
+    incarnation_id: int
     runtime_version: str
     pid: int
 
@@ -94,7 +94,7 @@ class AgentSession:
             wire.run_key,
             wire.session,
             identity.index,
-            identity.incarnation,
+            identity.incarnation_id,
             limits=wire.limits,
         )
         self.datagrams_to_send = self.link.datagrams_to_send

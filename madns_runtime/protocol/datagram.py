@@ -6,7 +6,7 @@ the conversation and stay the same in all datagrams of one direction; then come 
 acknowledgements and the windows granted. The MAC is keyed BLAKE2b over everything before it.
 
 Every conversation has its own pair of keys, one a direction, derived from the run key, the session,
-the agent and the agent's incarnation (drawn anew whenever its process starts). A packet number is
+the agent and the agent's incarnation id (drawn anew whenever its process starts). A packet number is
 therefore never used twice with one key, and nothing that an earlier process sent is valid for a later.
 """
 
@@ -26,10 +26,10 @@ MAC_BYTES: Final = 16
 KEY_BYTES: Final = 32
 SESSION_BYTES: Final = 8
 AGENT_INDEX_MAX: Final = 65_535
-INCARNATION_MAX: Final = 2**32 - 1
+INCARNATION_ID_MAX: Final = 2**32 - 1
 
 PREFIX: Final = Struct("<BBHI8s")
-"""version, role of the sender, agent index, incarnation, session."""
+"""version, role of the sender, agent index, incarnation id, session."""
 REST: Final = Struct("<QQQQQHHHBB")
 """packet number; largest packet received and the 64 before it; next fragment expected, RELIABLE then
 SYNC; fragments granted beyond these, RELIABLE then SYNC; time between receiving that largest packet and
@@ -97,7 +97,7 @@ class LinkKeys:
         return "LinkKeys(...)"
 
 
-def derive_keys(run_key: bytes, session: bytes, agent_index: int, incarnation: int) -> LinkKeys:
+def derive_keys(run_key: bytes, session: bytes, agent_index: int, incarnation_id: int) -> LinkKeys:
     """
     Derive the two keys of one agent's conversation with the host.
 
@@ -105,14 +105,14 @@ def derive_keys(run_key: bytes, session: bytes, agent_index: int, incarnation: i
         run_key: Secret of the run, 32 to 64 bytes.
         session: Public number of the run, 8 bytes.
         agent_index: 1 to 65535.
-        incarnation: Drawn by the agent's process at its start, 32 bits.
+        incarnation_id: Drawn by the agent's process at its start, 32 bits.
 
     Raises:
         ValueError: An argument is out of bounds.
     """
     if not KEY_BYTES <= len(run_key) <= 64:
         raise ValueError(f"expected a run key of 32 to 64 bytes, got {len(run_key)}")
-    context = _pack_prefix(session, agent_index, incarnation, Role.AGENT)
+    context = _pack_prefix(session, agent_index, incarnation_id, Role.AGENT)
     return LinkKeys(
         up=blake2b(context, digest_size=KEY_BYTES, key=run_key, person=b"madns link up").digest(),
         down=blake2b(
@@ -121,14 +121,14 @@ def derive_keys(run_key: bytes, session: bytes, agent_index: int, incarnation: i
     )
 
 
-def _pack_prefix(session: bytes, agent_index: int, incarnation: int, role: Role) -> bytes:
+def _pack_prefix(session: bytes, agent_index: int, incarnation_id: int, role: Role) -> bytes:
     if len(session) != SESSION_BYTES:
         raise ValueError(f"expected a session of {SESSION_BYTES} bytes, got {len(session)}")
     if not 1 <= agent_index <= AGENT_INDEX_MAX:
         raise ValueError(f"expected an agent index of 1 to {AGENT_INDEX_MAX}, got {agent_index}")
-    if not 0 <= incarnation <= INCARNATION_MAX:
-        raise ValueError(f"expected an incarnation of 32 bits, got {incarnation}")
-    return PREFIX.pack(VERSION, role, agent_index, incarnation, session)
+    if not 0 <= incarnation_id <= INCARNATION_ID_MAX:
+        raise ValueError(f"expected an incarnation id of 32 bits, got {incarnation_id}")
+    return PREFIX.pack(VERSION, role, agent_index, incarnation_id, session)
 
 
 def agent_index_of(datagram: bytes) -> int:
@@ -142,7 +142,7 @@ class Header(NamedTuple):
     version: int
     role: int
     agent_index: int
-    incarnation: int
+    incarnation_id: int
     session: bytes
     packet_number: int
 
@@ -159,7 +159,7 @@ class Seal:
 
     __slots__ = (
         "agent_index",
-        "incarnation",
+        "incarnation_id",
         "peer_prefix",
         "prefix",
         "receive_mac",
@@ -167,14 +167,14 @@ class Seal:
     )
 
     def __init__(
-        self, keys: LinkKeys, role: Role, *, session: bytes, agent_index: int, incarnation: int
+        self, keys: LinkKeys, role: Role, *, session: bytes, agent_index: int, incarnation_id: int
     ) -> None:
         is_agent = role is Role.AGENT
         peer = Role.HOST if is_agent else Role.AGENT
         self.agent_index = agent_index
-        self.incarnation = incarnation
-        self.prefix = _pack_prefix(session, agent_index, incarnation, role)
-        self.peer_prefix = _pack_prefix(session, agent_index, incarnation, peer)
+        self.incarnation_id = incarnation_id
+        self.prefix = _pack_prefix(session, agent_index, incarnation_id, role)
+        self.peer_prefix = _pack_prefix(session, agent_index, incarnation_id, peer)
         send_key, receive_key = (keys.up, keys.down) if is_agent else (keys.down, keys.up)
         # Copying a hash that has taken its key already is faster than keying a new one.
         self.send_mac = blake2b(digest_size=MAC_BYTES, key=send_key)

@@ -52,8 +52,8 @@ class Peer:
     address: Address | None = None
     pid: int | None = None
     """Process that said hello; None until one did."""
-    incarnations_seen: set[int] = field(default_factory=set)
-    """Incarnations of all processes that spoke for the agent; the link's is the present one."""
+    incarnation_ids_seen: set[int] = field(default_factory=set)
+    """Random numbers of all processes that spoke for the agent; the link's is the present one."""
     heard_s: float = 0.0
     pings: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=PINGS_MAX))
     """Pings not answered yet: the agent's time, and when it came. Older ones give way: they would tell less of its clock."""
@@ -72,7 +72,7 @@ class Peer:
     @property
     def incarnation(self) -> int:
         """Count of the starts of the agent that have spoken."""
-        return len(self.incarnations_seen)
+        return len(self.incarnation_ids_seen)
 
 
 class Roster:
@@ -253,7 +253,7 @@ class HostLinks:
             return None
         peer = self._by_index[header.agent_index]
         link = peer.link
-        if link is None or header.incarnation != link.incarnation:
+        if link is None or header.incarnation_id != link.incarnation_id:
             link = self._receive_stranger(peer, header, data, now_s)
         elif not link.receive_datagram(data, now_s):
             return None
@@ -278,14 +278,14 @@ class HostLinks:
         self, peer: Peer, header: Header, data: bytes, now_s: float
     ) -> Link | None:
         """Take the first datagram of an incarnation, which must prove that it holds the run key: its link."""
-        seen = peer.incarnations_seen
+        seen = peer.incarnation_ids_seen
         is_over = peer.phase in (Phase.COMPLETE, Phase.STOPPED)
-        if header.incarnation in seen or len(seen) >= INCARNATIONS_MAX or is_over:
+        if header.incarnation_id in seen or len(seen) >= INCARNATIONS_MAX or is_over:
             self.refused["old_incarnation"] += 1
             return None
         wire = self._wire
         link = Link.for_host(
-            wire.run_key, wire.session, peer.index, header.incarnation, limits=wire.limits
+            wire.run_key, wire.session, peer.index, header.incarnation_id, limits=wire.limits
         )
         if not link.receive_datagram(data, now_s):
             for reason, count in link.counters.refused.items():
@@ -302,7 +302,7 @@ class HostLinks:
             peer.retired_records.append(peer.records)
             peer.records = {}
         peer.link = link
-        peer.incarnations_seen.add(link.incarnation)
+        peer.incarnation_ids_seen.add(link.incarnation_id)
         peer.pings.clear()
         peer.timer_s = _NEVER
 

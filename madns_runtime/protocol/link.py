@@ -54,7 +54,7 @@ class Link:
         "datagrams_to_send",
         "get_timer",
         "handle_timer",
-        "incarnation",
+        "incarnation_id",
         "next_broken_deadline",
         "next_message",
         "open_best",
@@ -65,7 +65,7 @@ class Link:
     def __init__(self, *, seal: Seal, limits: LinkLimits = LinkLimits()) -> None:  # noqa: B008 - frozen
         self._counters = counters = LinkCounters()
         self._seal = seal
-        self.incarnation = seal.incarnation
+        self.incarnation_id = seal.incarnation_id
         """Incarnation of the agent's process in this conversation."""
         self.peer_prefix = seal.peer_prefix
         """The first bytes of every datagram from this peer: a key to find the link by."""
@@ -88,13 +88,13 @@ class Link:
         run_key: bytes,
         session: bytes,
         agent_index: int,
-        incarnation: int,
+        incarnation_id: int,
         *,
         limits: LinkLimits = LinkLimits(),  # noqa: B008 - frozen
     ) -> Link:
         """Return the agent's end of a conversation; see `datagram.derive_keys` for the arguments."""
         return cls(
-            seal=_seal(run_key, session, agent_index, incarnation, Role.AGENT), limits=limits
+            seal=_seal(run_key, session, agent_index, incarnation_id, Role.AGENT), limits=limits
         )
 
     @classmethod
@@ -103,12 +103,14 @@ class Link:
         run_key: bytes,
         session: bytes,
         agent_index: int,
-        incarnation: int,
+        incarnation_id: int,
         *,
         limits: LinkLimits = LinkLimits(),  # noqa: B008 - frozen
     ) -> Link:
         """Return the host's end of a conversation; see `datagram.derive_keys` for the arguments."""
-        return cls(seal=_seal(run_key, session, agent_index, incarnation, Role.HOST), limits=limits)
+        return cls(
+            seal=_seal(run_key, session, agent_index, incarnation_id, Role.HOST), limits=limits
+        )
 
     # What the owner asks.
 
@@ -265,6 +267,8 @@ class Link:
                 self._outgoing.watch.give_up()
 
 
-def _seal(run_key: bytes, session: bytes, agent_index: int, incarnation: int, role: Role) -> Seal:
-    keys = derive_keys(run_key, session, agent_index, incarnation)
-    return Seal(keys, role, session=session, agent_index=agent_index, incarnation=incarnation)
+def _seal(
+    run_key: bytes, session: bytes, agent_index: int, incarnation_id: int, role: Role
+) -> Seal:
+    keys = derive_keys(run_key, session, agent_index, incarnation_id)
+    return Seal(keys, role, session=session, agent_index=agent_index, incarnation_id=incarnation_id)

@@ -58,7 +58,7 @@ class AgentPort:
             AgentIdentity(
                 name=name,
                 index=config.agents.resolved_names().index(name) + 1,
-                incarnation=int.from_bytes(os.urandom(4)),
+                incarnation_id=int.from_bytes(os.urandom(4)),
                 runtime_version=__version__,
                 pid=os.getpid(),
             ),

@@ -110,7 +110,9 @@ class HostFaults:
     def _worn_out(self, agents: Sequence[str]) -> list[str]:
         """Return those of some agents that the host would not take back once more."""
         peers = self._port.session.peers
-        return [name for name in agents if len(peers[name].incarnations_seen) >= INCARNATIONS_MAX]
+        return [
+            name for name in agents if len(peers[name].incarnation_ids_seen) >= INCARNATIONS_MAX
+        ]
 
     def _order(self, action: TimelineAction, *, begins: bool) -> list[str]:
         """Have agents begin or end a fault of their steps; return who is not there."""

@@ -160,7 +160,7 @@ def _agent_result(
     return {
         "state": peer.phase.value,
         "reason": loss_reason,
-        "incarnations": len(peer.incarnations_seen),
+        "incarnations": len(peer.incarnation_ids_seen),
         **summary,
         "messages": _messages(
             peer,

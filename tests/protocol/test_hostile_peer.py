@@ -41,7 +41,7 @@ class Liar:
             Role.AGENT,
             session=SESSION,
             agent_index=7,
-            incarnation=99,
+            incarnation_id=99,
         )
 
     def near(self, value):

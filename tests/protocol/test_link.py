@@ -98,7 +98,7 @@ def test_datagrams_of_a_peer_start_with_its_prefix():
 
     assert datagram.startswith(host.peer_prefix)
     assert Header.peek(datagram).agent_index == 1
-    assert Header.peek(datagram).incarnation == 2
+    assert Header.peek(datagram).incarnation_id == 2
 
 
 def test_best_must_fit_one_datagram():

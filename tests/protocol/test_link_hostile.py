@@ -138,7 +138,7 @@ def make_host_and_forge():
         Role.AGENT,
         session=SESSION,
         agent_index=7,
-        incarnation=99,
+        incarnation_id=99,
     )
 
     def forge(payload=b"", **fields):

@@ -25,7 +25,7 @@ SESSION = b"12345678"
 
 def make_seal(role, *, run_key=RUN_KEY, session=SESSION, agent_index=3, incarnation=5):
     keys = derive_keys(run_key, session, agent_index, incarnation)
-    return Seal(keys, role, session=session, agent_index=agent_index, incarnation=incarnation)
+    return Seal(keys, role, session=session, agent_index=agent_index, incarnation_id=incarnation)
 
 
 def close(seal, payload=b"frames", packet_number=1):
@@ -80,7 +80,7 @@ def test_header_is_seen_without_a_key():
         version=VERSION,
         role=Role.AGENT,
         agent_index=3,
-        incarnation=5,
+        incarnation_id=5,
         session=SESSION,
         packet_number=77,
     )

@@ -68,7 +68,7 @@ class World:
             AgentIdentity(
                 name=name,
                 index=self.names.index(name) + 1,
-                incarnation=self.incarnation,
+                incarnation_id=self.incarnation,
                 runtime_version=__version__,
                 pid=1,
             ),
@@ -474,7 +474,9 @@ def test_datagrams_of_strangers_change_nothing_but_counters():
     stranger = World(("agent-1",))
     stranger.join("agent-1")
     session = AgentSession(
-        AgentIdentity(name="agent-1", index=1, incarnation=77, runtime_version=__version__, pid=1),
+        AgentIdentity(
+            name="agent-1", index=1, incarnation_id=77, runtime_version=__version__, pid=1
+        ),
         LinkSettings(run_key=b"x" * 32, session=WIRE.session),
         timeouts=TIMEOUTS,
         report=dict,
@@ -601,7 +603,7 @@ def test_messages_to_a_lost_agent_are_counted():
 def test_agent_of_another_version_is_refused_with_both_versions():
     w = World(("agent-1",))
     w.agents["agent-1"] = AgentSession(
-        AgentIdentity(name="agent-1", index=1, incarnation=1, runtime_version="0.0.1", pid=1),
+        AgentIdentity(name="agent-1", index=1, incarnation_id=1, runtime_version="0.0.1", pid=1),
         WIRE,
         timeouts=TIMEOUTS,
         report=dict,

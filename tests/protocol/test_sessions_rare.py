@@ -219,7 +219,7 @@ def test_broken_deadline_of_an_agents_own_message_is_told_once():
 def test_agent_that_gives_another_name_than_its_place_is_refused(name):
     w = World(("agent-1",))
     w.agents["agent-1"] = AgentSession(
-        AgentIdentity(name=name, index=1, incarnation=9, runtime_version=__version__, pid=1),
+        AgentIdentity(name=name, index=1, incarnation_id=9, runtime_version=__version__, pid=1),
         WIRE,
         timeouts=TIMEOUTS,
         report=dict,

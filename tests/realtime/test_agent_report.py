@@ -47,7 +47,9 @@ def made(devices, *, problem="", text=""):
 def heard_by_the_host(report):
     """Return what the host has of an agent once it has pinged."""
     host = HostSession(["a"], WIRE, timeouts=Timeouts(), on_agent_loss="abort", now_s=0.0)
-    identity = AgentIdentity(name="a", index=1, incarnation=1, runtime_version=__version__, pid=1)
+    identity = AgentIdentity(
+        name="a", index=1, incarnation_id=1, runtime_version=__version__, pid=1
+    )
     session = AgentSession(identity, WIRE, timeouts=Timeouts(), report=report.ping, now_s=0.0)
     session.handle_timer(0.0)
     for datagram in session.datagrams_to_send(0.0):

@@ -20,7 +20,7 @@ class Session:
     def __init__(self) -> None:
         self.sent: list[tuple[str, AgentFault]] = []
         self.full: set[str] = set()
-        self.peers = {name: SimpleNamespace(incarnations_seen=["x"]) for name in ("a", "b")}
+        self.peers = {name: SimpleNamespace(incarnation_ids_seen=["x"]) for name in ("a", "b")}
 
     def send(self, agent: str, order: AgentFault, *_: Any) -> bool:
         if agent in self.full:
@@ -87,7 +87,7 @@ def test_one_that_was_killed_and_is_back_can_be_killed_again() -> None:
 
 def test_an_agent_that_no_host_would_take_back_again_is_not_sent_away_to_return() -> None:
     faults, session = some_faults()
-    session.peers["a"].incarnations_seen = list(range(INCARNATIONS_MAX))
+    session.peers["a"].incarnation_ids_seen = list(range(INCARNATIONS_MAX))
 
     with pytest.raises(ActionRefused, match="a: started 128 times, as often as a run takes one"):
         faults.begin(an_action(0, "restart", "a"))

@@ -20,7 +20,7 @@ class Session:
         self.heard: list[tuple[str, str, float]] = []
         self.awaited: list[bool] = []
         self.end_host_s = 0.0
-        self.peers = {name: SimpleNamespace(incarnations_seen=[1]) for name in ("a", "b")}
+        self.peers = {name: SimpleNamespace(incarnation_ids_seen=[1]) for name in ("a", "b")}
 
     def send(self, agent: str, order: Any, *_: Any) -> bool:
         if agent in self.away:
