@@ -12,8 +12,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import INCARNATION_MAX, StreamScan
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.config import RunConfig
-from madns_runtime.plain_values import first_few
-from madns_runtime.plain_values import mapping_at as mapping_at
+from madns_runtime.plain_values import first_few, mapping_at
 from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS, TICKS
 
 AGENT_STREAMS = tuple(schema.name for schema in (TICKS, CLOCK, EVENTS, LOG, PROCESS))
@@ -33,12 +32,12 @@ NO_FILES: Mapping[str, Sequence[str]] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExpectedRecords:
-    """Recording roles and their least streams; a simulation's own are in the summaries."""
+    """Sources that must have recorded, and their least streams; a simulation's own are in the summaries."""
 
     agents: tuple[str, ...] = ()
     machines: tuple[str, ...] = ()
     devices: tuple[str, ...] = ()
-    """Full names."""
+    """Full names of devices."""
     agent_streams: tuple[str, ...] = AGENT_STREAMS
     host_streams: tuple[str, ...] = HOST_STREAMS
     machine_streams: tuple[str, ...] = MACHINE_STREAMS
@@ -137,7 +136,7 @@ def is_excused(scan: StreamScan, agents: Mapping[str, Any]) -> bool:
 
 
 def _owes_records(agent: Mapping[str, Any]) -> bool:
-    """Tell whether an agent was not ended on purpose, or has lived again after that."""
+    """Tell whether an agent was not ended on purpose, or was started again after that."""
     ended, incarnations = ended_on_purpose(agent), agent.get("incarnations")
     return not ended or (isinstance(incarnations, int) and incarnations > max(ended))
 

@@ -30,7 +30,7 @@ class Announcements:
         self._emit({"event": "state", "state": state.value})
 
     def agent_moved(self, event: AgentMoved, *, is_intended: bool = False) -> None:
-        """Tell the new phase of an agent; *is_intended* of one that is lost on purpose."""
+        """Tell the new phase of an agent; *is_intended* where it is lost on purpose."""
         moved = {
             "agent": event.agent,
             "state": event.phase.value,

@@ -73,7 +73,7 @@ class HostFaults:
             self._order(action, begins=False)
 
     def end_at(self, end_s: float) -> None:
-        """Take simulated time *end_s* for the run's end, s: nobody waits for who was to return after it."""
+        """Let the run end at simulated time *end_s*, s: agents that were to return after it are not waited for."""
         self._duration_s = end_s
         self._port.session.await_returns(self.intended.are_expected(end_s))
 
@@ -83,13 +83,11 @@ class HostFaults:
         if not self._goes_on:
             raise ActionRefused(words.MUST_CONTINUE)
         after_s = 0.0 if action.word == words.RESTART else action.for_s
-        returns_s = None if after_s is None else self._port.now_s() + after_s
+        now_s = self._port.now_s()
+        returns_s = None if after_s is None else now_s + after_s
         why = words.killed_words(action)
         value = math.nan
-        if (
-            after_s is not None
-            and self._port.now_s() + max(after_s, RETURN_S_MIN) < self._duration_s
-        ):
+        if after_s is not None and now_s + max(after_s, RETURN_S_MIN) < self._duration_s:
             value = after_s  # else no tick would be left for it: as in lockstep it stays away
         absent = [] if after_s is None else self._worn_out(action.agents)
         if absent and len(absent) == len(action.agents):
