@@ -33,7 +33,7 @@ class Fleet:
     forks: int = FORKS_DEFAULT
     options: ConnectOptions = ConnectOptions()
     load: Callable[[], tuple[Machine, ...]] = tuple
-    """Reads the inventory; who needs the targets alone is spared it."""
+    """Reads the inventory; not called where the targets alone are needed."""
     sources: tuple[str, ...] = ()
     """Inventories that -i named."""
 
@@ -78,7 +78,7 @@ class Fleet:
         on_done: Callable[[Outcome[T]], None] = lambda outcome: None,
         on_wait: Callable[[], None] = lambda: None,
     ) -> list[Outcome[T]]:
-        """Do the same without asking what the inventory says beyond how to reach the machines; *on_wait* as `for_each`."""
+        """Do as `each`, for a *task* that needs no entry of the inventory, which is then not read; *on_wait* as in `for_each`."""
         lock = threading.Lock()
         living: set[Connection] = set()
         is_over = False

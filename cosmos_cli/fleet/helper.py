@@ -1,7 +1,7 @@
 """
 The operator's side of what works on a machine: sends the sources of `cosmos_cli.onboard`, then asks.
 
-One connection, one process there, one frame a question. For the pool's threads: every call has a deadline.
+One connection, one process there, one frame per question. For the pool's threads: every call has a deadline.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ PYTHONS = ("python3", "python3.13", "python3.12", "python3.11", "/usr/bin/python
 START_TIMEOUT_S = 20.0
 CALL_TIMEOUT_S = 30.0
 WHOLE_TIMEOUT_S = 3600.0
-"""For an answer in pieces, beside what its bytes are worth."""
+"""Time for an answer in pieces, beside what its bytes are worth."""
 
 LAST_WORDS_S = 5.0
 LAST_WORDS_BYTES_MAX = 4 * 1024 * 1024
-"""For what comes of a start that has failed."""
+"""Time and bytes for what comes of a start that has failed."""
 
 _BOOT = (
     "import marshal,sys,zlib;PACKAGE=sys.stdin.buffer.read(int(sys.argv[1]));"
@@ -102,8 +102,8 @@ class Helper:
     Use it as a context manager; leaving it ends that process.
 
     Args:
-        stream: To the process; it has greeted already.
-        greeting: What it said of itself: python, executable, machine, bits, libc, uid, home, node, pid.
+        stream: To the process.
+        watch: Looks into the machine's silence; None leaves all to the deadlines.
     """
 
     def __init__(self, stream: Stream, watch: SilenceWatch | None = None) -> None:
@@ -112,8 +112,9 @@ class Helper:
         self._answers = AnswerReader(self._link)
         self._is_out_of_step = False
         self.machine = ""
-        """Its name; empty for one that was not started by `start`."""
+        """Name of the machine; empty for a helper that was not started by `start`."""
         self.greeting: Mapping[str, Any] = {}
+        """What the process said of itself: python, executable, machine, bits, libc, uid, home, node, pid; empty before."""
 
     @classmethod
     def start(
@@ -166,7 +167,7 @@ class Helper:
         self.greeting = self._read_answer(expected, timeout_s=timeout_s)[0]["value"]
 
     def _last_words(self, expected: ExpectedAnswer) -> MachineFailure | None:
-        """Return what one that has ended said instead of a greeting, which tells more than that it has; None for nothing."""
+        """Return what a process that has ended said instead of a greeting: it tells more than the end; None for nothing."""
         try:
             self._read_answer(expected, timeout_s=LAST_WORDS_S)
         except MachineFailure as failure:
