@@ -171,6 +171,8 @@ class MachineFacts:
     """Keys of wanted environments that are there, whole and unchanged."""
     prunable: tuple[str, ...] = ()
     """Trees, environments and wheels that nobody uses, such as trees/<hash>."""
+    prunable_bytes: int = 0
+    """Room that these take on the disk, at least."""
 
     @classmethod
     def from_mapping(

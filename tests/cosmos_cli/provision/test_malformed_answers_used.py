@@ -152,6 +152,7 @@ INSTALLED = {
     "trees": {},
     "environments": {},
     "prunable": {"trees": ["a"], "environments": [], "wheels": []},
+    "prunable_bytes": 4096,
 }
 ROUND_TRIPS = {"round_trips": {"count": 1}, "wake_ups": {"count": 1}}
 USES = {

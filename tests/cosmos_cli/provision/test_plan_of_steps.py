@@ -193,6 +193,29 @@ def test_full_disk_is_refused_before_anything_is_sent():
     )
 
 
+@pytest.mark.parametrize("missing_bytes", [0, 1])
+def test_disk_without_room_for_all_is_pruned_before_anything_else_takes_room(missing_bytes):
+    """Of what nobody uses three environments stay there: a fourth may find room only when the oldest has gone."""
+    needed, freed = FakeEnvironment.size_bytes + RESERVE_BYTES, 100_000_000
+    free = needed - freed - missing_bytes
+    old = {"prunable": ("environments/old",), "prunable_bytes": freed}
+    facts = facts_of(files={f"{HOME}/cosmos": None}, disk={"free_bytes": free}, **old)
+
+    steps = plan_steps(
+        facts, wanted(variables={"cosmos_realtime_priority": 1}, environments=(FakeEnvironment(),))
+    )
+
+    kinds = [step.kind.value for step in steps]
+    assert kinds == ["directory", "prune", "setting", "environment"]
+    if not missing_bytes:
+        check_possible(facts, steps)
+        return
+    assert refused(steps, disk={"free_bytes": free}, **old) == (
+        "disk_full",
+        "about 116 MB are needed on /home/pi, 16 MB are free, and pruning frees 100 MB",
+    )
+
+
 def test_full_disk_is_pruned_where_nothing_else_is_to_be_done():
     prune = Step(kind=Kind.PRUNE, title="prune what nobody uses: trees/0")
 
