@@ -20,6 +20,7 @@ from cosmos_cli.commands.fleet_command import (
     finish,
     fleet_of,
     row_teller,
+    warn_of_same,
     without_this_computer,
 )
 from cosmos_cli.errors import InputError
@@ -35,7 +36,7 @@ from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
 from madns_runtime.plain_values import first_few
 
-PARTS = ("files", "links", "facts", "scratch", "system", "apt_words", "apt")
+PARTS = ("files", "links", "dpkg", "facts", "scratch", "system", "apt_words", "apt")
 PIECE_TIMEOUT_S = 60.0
 """A sign of life comes each second; a slow card may hold one up."""
 TIMEOUT_S = 1800.0
@@ -88,6 +89,7 @@ def packages(
     console = Console(json=json, quiet=quiet, instead=WORK_GOES_ON)
     wanted = check_names(action, names or [])
     fleet = without_this_computer(console, fleet_of(inventory, limit, forks, accept_new_host_keys))
+    warn_of_same(console, fleet)
     start_s = time.monotonic()
     outcomes = _change(console, fleet, action, wanted, timeout_s=timeout_s, is_check=check)
     return finish(

@@ -19,6 +19,8 @@ from cosmos_cli.onboard.request_loop import PlainValue, VerbRequest, sha256, ver
 CACHE = "__pycache__"
 NEWEST_KEPT = 2
 """Of the trees of one label, and of the environments, that nobody asks for."""
+BLOCK_BYTES = 512
+"""Unit of `st_blocks`, whatever the file system's own is."""
 ORPHAN_S = 3600.0
 """A wheel that belongs to no environment after so long belongs to nobody."""
 
@@ -46,7 +48,11 @@ def installed(request: VerbRequest) -> dict[str, PlainValue]:
         told[kind] = {name: is_whole(kind, os.path.join(folders[kind], name)) for name in names}
         for name in names if asked.get("touch") else ():
             told[kind][name] = told[kind][name] and _touch(os.path.join(folders[kind], name))
-    return {**told, "prunable": prunable(folders, wanted)}
+    going = prunable(folders, wanted)
+    is_any_missing = not all(told["environments"].values())
+    told["wheels"] = wheels_there(folders["wheels"], going["wheels"]) if is_any_missing else []
+    paths = [os.path.join(folders[kind], name) for kind, names in going.items() for name in names]
+    return {**told, "prunable": going, "prunable_bytes": freed_bytes(paths)}
 
 
 def _touch(path: str) -> bool:
@@ -185,6 +191,33 @@ def prunable(folders: Mapping[str, str], wanted: Mapping[str, PlainValue]) -> di
         found[kind] = [os.path.basename(path) for path in rest if path not in in_use]
     found["wheels"] = _orphans(folders, found["environments"])
     return found
+
+
+def wheels_there(folder: str, going: Sequence[str]) -> list[str]:
+    """Return the names of the dist-info folders of whole wheels that stay: an environment takes no room for them."""
+    names = (name for name in content_store.names_in(folder) if name not in going)
+    marks = (content_store.read_mark(os.path.join(folder, name)) or {} for name in names)
+    return sorted({str(mark["info"]) for mark in marks if mark.get("info")})
+
+
+def freed_bytes(paths: Sequence[str]) -> int:
+    """
+    Return what the disk gets back at least when all of these are removed.
+
+    A file of an environment is a wheel's as well, by a hard link: it is counted once, and only if its last name goes.
+    """
+    names_left: dict[tuple[int, int], int] = {}
+    found_bytes = 0
+    for path in paths:
+        with contextlib.suppress(OSError):  # what goes meanwhile frees its room by itself
+            is_folder = os.path.isdir(path) and not os.path.islink(path)
+            for name in content_store.files_below(path, "") if is_folder else ("",):
+                status = os.lstat(os.path.join(path, name) if name else path)
+                inode = status.st_dev, status.st_ino
+                names_left[inode] = names_left.get(inode, status.st_nlink) - 1
+                if not names_left[inode]:
+                    found_bytes += status.st_blocks * BLOCK_BYTES
+    return found_bytes
 
 
 def _newest(paths: list[str]) -> set[str]:

@@ -118,6 +118,8 @@ def _with_installed(facts: MachineFacts, told: Mapping[str, Any]) -> MachineFact
         trees=frozenset(name for name, is_whole in told["trees"].items() if is_whole),
         environments=frozenset(key for key, is_whole in told["environments"].items() if is_whole),
         prunable=tuple(f"{kind}/{name}" for kind, names in prunable.items() for name in names),
+        prunable_bytes=told.get("prunable_bytes", 0),
+        wheels=frozenset(told.get("wheels") or ()),
     )
 
 

@@ -1,7 +1,8 @@
 """
 The plan of `cosmos up`: from what a machine is and what it should be, the steps between them, and notes. Pure.
 
-Only what must change is a step. PLANNERS is the order of things: a new kind of step has its place there.
+Only what must change is a step. PLANNERS is the order of things: a new kind of step has its place there. On a disk
+that has no room for all of it, what nobody uses is pruned first.
 """
 
 from __future__ import annotations
@@ -37,7 +38,16 @@ def plan_steps(facts: MachineFacts, desired: DesiredState) -> tuple[Step, ...]:
     Raises:
         MachineFailure: Something that is wanted cannot be had on this machine.
     """
-    return tuple(step for planner in PLANNERS for step in planner(facts, desired))
+    steps = tuple(step for planner in PLANNERS for step in planner(facts, desired))
+    if _needed_bytes(steps) <= facts.disk.free_bytes:
+        return steps
+    # What nobody uses makes room for what is wanted, and goes last only where both find it.
+    first = (Kind.DIRECTORY, Kind.PRUNE)
+    return tuple(sorted(steps, key=lambda step: (*first, step.kind).index(step.kind)))
+
+
+def _needed_bytes(steps: tuple[Step, ...]) -> int:
+    return sum(step.size_bytes for step in steps) + RESERVE_BYTES
 
 
 def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
@@ -70,13 +80,16 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
         )
     if not steps:
         return
-    needed_bytes = sum(step.size_bytes for step in steps) + RESERVE_BYTES
-    only_frees = all(step.kind is Kind.PRUNE for step in steps)  # a full disk is a reason for it
-    if needed_bytes > disk.free_bytes and not only_frees:
+    needed_bytes = _needed_bytes(steps)
+    freeing = [step for step in steps if step.kind is Kind.PRUNE]
+    freed_bytes = facts.prunable_bytes if freeing else 0
+    only_frees = len(freeing) == len(steps)  # a full disk is a reason for it
+    if needed_bytes > disk.free_bytes + freed_bytes and not only_frees:
+        also = f", and pruning frees {megabytes(freed_bytes)}" if freed_bytes else ""
         raise MachineFailure(
             FailureKind.DISK_FULL,
             f"about {megabytes(needed_bytes)} are needed on {disk.path},"
-            f" {megabytes(disk.free_bytes)} are free",
+            f" {megabytes(disk.free_bytes)} are free{also}",
             "make room there (`cosmos wipe` removes runs that were collected), or move cosmos_root",
         )
     rooted = [step.title for step in steps if step.needs_root]
@@ -132,7 +145,7 @@ def _environments(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
                 kind=Kind.ENVIRONMENT,
                 title=f"environment {environment.key}: build with {len(environment.lock)} packages",
                 subject=environment,
-                size_bytes=environment.size_bytes,
+                size_bytes=environment.size_bytes(facts.wheels),
             )
 
 

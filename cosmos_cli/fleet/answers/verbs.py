@@ -116,6 +116,8 @@ def _installed(asked: Asked) -> Shape:
             "trees": map_with(asked["trees"], flag),
             "environments": map_with(asked["environments"], flag),
             "prunable": prunable,
+            "prunable_bytes": size,
+            "wheels": names,
         }
     )
 

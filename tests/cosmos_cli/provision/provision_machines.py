@@ -32,9 +32,9 @@ def told(**changes):
 
 
 def facts_of(**changes):
-    prunable = tuple(changes.pop("prunable", ()))
+    prunable, prunable_bytes = tuple(changes.pop("prunable", ())), changes.pop("prunable_bytes", 0)
     facts = MachineFacts.from_mapping(told(**changes), asked_utc_s=1000.0, answered_utc_s=1001.0)
-    return dataclasses.replace(facts, prunable=prunable)
+    return dataclasses.replace(facts, prunable=prunable, prunable_bytes=prunable_bytes)
 
 
 def machine_of(*, variables=None, packages=(), provision=()):

@@ -152,6 +152,8 @@ INSTALLED = {
     "trees": {},
     "environments": {},
     "prunable": {"trees": ["a"], "environments": [], "wheels": []},
+    "prunable_bytes": 4096,
+    "wheels": ["numpy-2.0.0.dist-info"],
 }
 ROUND_TRIPS = {"round_trips": {"count": 1}, "wake_ups": {"count": 1}}
 USES = {
