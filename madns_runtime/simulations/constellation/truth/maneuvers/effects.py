@@ -91,8 +91,11 @@ class Timeline:
         return tuple(e for e in self.effects if e.start_s > t_s or e.end_s > t_s)
 
     def between(self, t0_s: float, t1_s: float) -> tuple[Effect, ...]:
-        """Return those that act within (t0_s, t1_s]."""
-        return tuple(e for e in self.from_time(t0_s) if e.start_s <= t1_s)
+        """Return those that act within (t0_s, t1_s], or later before the middle of a thrust arc that begins by then."""
+        later = self.from_time(t0_s)
+        middles_s = (e.at_s for e in later if e.kind == "thrust" and e.start_s <= t1_s)
+        until_s = max(middles_s, default=t1_s)  # where the arc's axes are taken
+        return tuple(e for e in later if e.start_s <= max(t1_s, until_s))
 
     def ballistic_at(self, t_s: float) -> float:
         """Return the ballistic coefficient from *t_s* on, m^2/kg."""
