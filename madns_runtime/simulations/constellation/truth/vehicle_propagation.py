@@ -36,6 +36,7 @@ from madns_runtime.simulations.constellation.truth.orbit_curves import OrbitCurv
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     conserved_by,
+    is_inside_earth,
     propagate,
 )
 from madns_runtime.simulations.constellation.truth.propagators.rigid_body import RigidBody
@@ -250,6 +251,8 @@ class _Flight:
 
     @staticmethod
     def _inertial(effect: Effect, state: Array) -> Vector:
+        if is_inside_earth(state[:6]):
+            return COASTING  # who has met the Earth stands still, and has no plane of motion
         attitude = state[6:10].tolist() if len(state) > 6 else None
         r, v = state[:3].tolist(), state[3:6].tolist()
         return vector_to_inertial(effect.vector, effect.frame, r, v, attitude)
