@@ -58,6 +58,17 @@ class Effect:
         """Whether it takes time."""
         return self.end_s > self.start_s
 
+    def moved(self, *, start_s: float | None = None, end_s: float | None = None) -> Effect:
+        """Return it with another beginning or end; what takes no time is moved as a whole."""
+        if not self.is_arc:
+            at_s = next(t_s for t_s in (start_s, end_s, self.at_s) if t_s is not None)
+            return replace(self, at_s=at_s, start_s=at_s, end_s=at_s)
+        return replace(
+            self,
+            start_s=self.start_s if start_s is None else start_s,
+            end_s=self.end_s if end_s is None else end_s,
+        )
+
 
 class Timeline:
     """The effects of one vehicle that truth may still depend on, in order."""
