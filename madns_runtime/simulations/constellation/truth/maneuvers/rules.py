@@ -370,7 +370,8 @@ class ManeuverDesk:
         if not isinstance(given, Burn) or thruster is None:
             return taken
         tank, commanded_m_s = self._tanks[taken.vehicle], math.hypot(*taken.command.vector)
-        expected_kg = tank.propellant_kg - propellant_of(thruster, tank.mass_kg, commanded_m_s)
+        needed_kg = propellant_of(thruster, tank.mass_kg, commanded_m_s)
+        expected_kg = max(0.0, tank.propellant_kg - needed_kg)
         effect, now_s = taken.effect, taken.heard_s - taken.command.phase_s
         assert effect is not None
         tank.book(given, effect.start_s, effect.end_s, now_s=now_s)
