@@ -21,6 +21,10 @@ class Dive:
         if t_s == 1.0:
             self.context.delta_v((-2000.0, 0.0, 0.0), at_s=4.0)
 """
+WAITING = """
+        if t_s == 2.0:
+            self.context.delta_v((0.0, 1000.0, 0.0), at_s=45.0)
+"""
 THRUSTER = {"thruster": {"isp_s": 1e5, "propellant_kg": 50}}
 
 
@@ -54,3 +58,22 @@ def test_the_others_go_on_and_what_fell_is_not_judged(star):
     summary = star.host.finish()
     assert summary["energy_drift_max"] < 1e-12
     assert all(check["passed"] for check in summary["checks"])
+
+
+@pytest.mark.parametrize("thrust_n", [None, 1e6], ids=["impulse", "arc"])
+def test_a_burn_that_waits_as_a_vehicle_falls_does_not_end_the_others(tmp_path, thrust_n):
+    (tmp_path / "dive.py").write_text(DIVE + WAITING)
+    flight = {"software": "dive.py:Dive", "input": "truth", "agents": ["FALLER"]}
+    vehicles = [{"thruster": THRUSTER["thruster"] | {"thrust_n": thrust_n}}]
+    settings = parameters(TWO, flight=flight, vehicles=vehicles)
+    star = Star(settings, count=2, duration_s=60.0, base_directory=tmp_path)
+
+    with pytest.raises(BlamedError, match="FALLER has met the Earth"):
+        star.run(60.0)
+
+    at_s = star.context.clock_s
+    del star.agents["agent-02"]
+    star.host.agent_lost("agent-02", "it fell")
+    star.run(60.0, from_s=at_s + 0.1)
+    assert state_rows(star, "agent-01")[-1, 0] == 599
+    assert star.host.finish()["maneuvers"]["executed"] == 2

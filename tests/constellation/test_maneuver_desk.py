@@ -217,6 +217,40 @@ def test_a_thruster_does_one_burn_at_a_time():
     assert "busy from 20.100 s to 20.100 s" in at.decide(0, command(20.0), 10.0).reason
 
 
+@pytest.mark.parametrize("is_later_first", [False, True])
+def test_a_burn_may_begin_where_another_ends_whatever_their_times_are_rounded_to(is_later_first):
+    exhaust_m_s = 220.0 * 9.80665
+    vehicle = Vehicle(thruster=replace(THRUSTER, thrust_n=20.0))
+    for tenth in range(1, 40):
+        # Both as long as the rocket equation makes them in the order in which they are commanded.
+        ratio = math.exp(-0.1 * tenth / exhaust_m_s)
+        first_s = 100.0 * (1.0 - ratio) * exhaust_m_s / 20.0
+        second_s = first_s * ratio
+        lengths_s = (second_s, first_s) if is_later_first else (first_s, second_s)
+        starts_s = (20.7, 20.7 + lengths_s[0])
+        middles_s = [starts_s[n] + lengths_s[n] / 2.0 for n in (0, 1)]
+        station = desk(vehicle)
+
+        taken = [
+            station.decide(0, command(at_s, number, vector=(0.0, 0.1 * tenth, 0.0)), 10.0)
+            for number, at_s in enumerate(reversed(middles_s) if is_later_first else middles_s)
+        ]
+
+        assert [one.status for one in taken] == ["accepted", "accepted"]
+        early, late = sorted((one.effect for one in taken), key=lambda effect: effect.start_s)
+        assert early.end_s == late.start_s
+
+
+def test_an_impulse_may_be_where_a_burn_ends():
+    station = desk(Vehicle(thruster=replace(THRUSTER, thrust_n=1e5)))
+    burn = station.decide(0, command(20.3, vector=(0.0, 100.0, 0.0)), 10.0)
+
+    taken = station.decide(0, command(burn.effect.end_s - 1e-9, 1, vector=(0.0, 1.0, 0.0)), 10.0)
+
+    assert (taken.status, taken.effect.kind) == ("accepted", "impulse")
+    assert taken.effect.at_s == taken.effect.start_s == taken.effect.end_s == burn.effect.end_s
+
+
 @pytest.mark.parametrize("factor", [0.0, 1e-3])
 def test_a_thruster_that_gives_next_to_nothing_takes_its_command_as_ever(factor):
     thruster = Thruster(isp_s=220.0, propellant_kg=20.0, minimum_impulse_n_s=50.0)

@@ -253,6 +253,18 @@ def test_a_vehicle_that_meets_the_earth_stands_still_there_and_the_others_fly_on
     assert not found[1, met + 1 :, 3:].any()
 
 
+@pytest.mark.parametrize("along_m_s", [0.0, 50.0])
+def test_a_steep_fall_through_a_long_call_ends_nobody_else(numerical, along_m_s):
+    states, knots_s = orbits(), np.arange(0.0, 2000.0, 100.0)
+    states[1, 3:] *= along_m_s / np.linalg.norm(states[1, 3:])
+
+    found = propagate(states, 0.0, knots_s, numerical.parameters())
+
+    expected = propagate(orbits(), 0.0, knots_s, numerical.parameters())
+    assert distance_m(found[[0, 2, 3]], expected[[0, 2, 3]]) < 1e-6
+    assert not found[1, -1, 3:].any()
+
+
 @pytest.mark.slow
 def test_a_call_that_begins_inside_the_earth_stays_where_it_began(kind):
     states = orbits()

@@ -137,8 +137,7 @@ def test_a_smaller_tolerance_gives_a_smaller_error():
 
 def test_all_failed_vehicles_are_named_up_to_a_limit():
     states = fleet(8)
-    # At the centre itself no number comes out.
-    states[:7, :3] = 0.0
+    states[:7, 5] = math.nan
     parameters = make(rest={"names": tuple("ABCDEFGH")})
 
     with pytest.raises(ConfigurationError) as error:

@@ -14,6 +14,7 @@ from madns_runtime.simulations.constellation.equipment import (
     Vehicle,
 )
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
+from madns_runtime.simulations.constellation.orbit.quaternions import rotate_back
 from madns_runtime.simulations.constellation.thrust import Thrust, velocity_gain_s, way_gain_s2
 from madns_runtime.simulations.constellation.truth import vehicle_propagation
 from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
@@ -22,7 +23,7 @@ from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
     chance_of,
     fire,
 )
-from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect, Timeline
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
 from madns_runtime.simulations.constellation.truth.propagators.forces import acceleration_of
 from madns_runtime.simulations.constellation.truth.propagators.rigid_body import (
@@ -155,3 +156,51 @@ def test_wheels_take_up_their_torque_through_all_legs_of_a_burn(monkeypatch):
 
     assert np.abs(in_legs.attitude - at_once.attitude).max() < 1e-9
     assert np.abs(in_legs.attitude[-1, 4:] - turned[4:]).max() > 0.1
+
+
+def turning(number, start_s, end_s, kind="torque"):
+    vector = (0.0, 0.0, 0.1) if kind == "torque" else (0.0, 300.0, 0.0)
+    return Effect(
+        number=number, kind=kind, at_s=start_s, start_s=start_s, end_s=end_s, vector=vector,
+        frame="body",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "turns",
+    [
+        (turning(1, 19.9, 20.1),),
+        (turning(1, 20.0, 20.2),),
+        (turning(1, 17.0, 20.0), turning(2, 22.0, 24.0), turning(3, 24.0, 25.0)),
+        (turning(1, 18.0, 22.0, "dipole"), turning(2, 29.0, 33.0)),
+    ],
+    ids=["begun before it", "begun with it", "several within it", "dipole"],
+)
+def test_a_burn_in_body_axes_is_along_those_of_its_middle_whatever_turns_the_body_meanwhile(turns):
+    body = RigidBody(inertia_kg_m2=(10.0, 12.0, 14.0))
+    burn = Effect(
+        number=0, kind="thrust", at_s=30.0, start_s=20.0, end_s=40.0, vector=(1.0, 0.0, 0.0),
+        frame="body", burnt=0.001,
+    )  # fmt: skip
+
+    def flown(*effects):
+        timeline = Timeline()
+        for effect in effects:
+            timeline.add(effect)
+        request = VehicleRequest(
+            start_s=0.0,
+            state=np.array((*STATE, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),
+            change_s=1.0,
+            end_knot=21 if burn in effects else 30,  # the middle is no part of what is asked for
+            knot_s=1.0,
+            effects=timeline.between(0.0, 21.0 if burn in effects else 30.0),
+            body=body,
+        )
+        return propagate_vehicle(request, PROPAGATION)
+
+    thrust = flown(burn, *turns).thrusts[0].acceleration_m_s2
+    axes = flown(*turns).attitude[-1, :4]
+
+    along = np.array(rotate_back(axes, (1.0, 0.0, 0.0)))
+    assert np.array(thrust) / np.linalg.norm(thrust) == pytest.approx(along, abs=1e-9)
+    assert np.abs(along - (1.0, 0.0, 0.0)).max() > 1e-3

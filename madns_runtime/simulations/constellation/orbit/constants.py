@@ -13,6 +13,9 @@ EARTH_FLATTENING = 1.0 / 298.257223563
 """Of the same ellipsoid; same source."""
 EARTH_POLAR_RADIUS_M = EARTH_RADIUS_M * (1.0 - EARTH_FLATTENING)
 """Smallest distance from the Earth's centre to its surface, m."""
+GRAVITY_RADIUS_M_MIN = 3e6
+"""Nearer to the centre than that gravity grows no more: who met the Earth is there on paper alone, until a call ends, and
+no integrator could follow a steep fall through the centre."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from types import ModuleType
@@ -35,6 +36,7 @@ from madns_runtime.simulations.constellation.truth.orbit_curves import OrbitCurv
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     conserved_by,
+    is_inside_earth,
     propagate,
 )
 from madns_runtime.simulations.constellation.truth.propagators.rigid_body import RigidBody
@@ -43,6 +45,8 @@ Array = NDArray[np.float64]
 ROUNDING_S = 1e-9
 """Knots nearer to each other than this are the same, computed on two ways."""
 COASTING: Vector = (0.0, 0.0, 0.0)
+TURNING = ("torque", "dipole")
+"""Effects that turn a body while they act."""
 THRUST_LEG_S = 10.0
 """Most of a thrust arc that is propagated in one call."""
 
@@ -230,11 +234,25 @@ class _Flight:
         if effect.frame == "inertial" or effect.at_s <= self._t_s:
             return self._inertial(effect, self._state)
         # Without the arc's own thrust: the frame that guidance, too, could foresee.
-        row = self._leg(self._state, self._t_s, [effect.at_s], None)[-1]
-        return self._inertial(effect, row)
+        return self._inertial(effect, self._coasted(effect.at_s))
+
+    def _coasted(self, until_s: float) -> Array:
+        """Return the state at a later time without thrust; torques and dipoles begin and end on the way."""
+        ahead, effects = copy(self), self._request.effects
+        edges_s = {t_s for e in effects if e.kind in TURNING for t_s in (e.start_s, e.end_s)}
+        for stop_s in sorted({until_s, *(t_s for t_s in edges_s if self._t_s < t_s < until_s)}):
+            acting = [e for e in effects if e.start_s <= ahead._t_s < e.end_s]
+            ahead._torque, ahead._dipole = (
+                next((e.vector for e in acting if e.kind == kind), COASTING) for kind in TURNING
+            )
+            ahead._state = ahead._leg(ahead._state, ahead._t_s, [stop_s], None)[-1]
+            ahead._body, ahead._t_s = ahead._body_at(stop_s), stop_s
+        return ahead._state
 
     @staticmethod
     def _inertial(effect: Effect, state: Array) -> Vector:
+        if is_inside_earth(state[:6]):
+            return COASTING  # who has met the Earth stands still, and has no plane of motion
         attitude = state[6:10].tolist() if len(state) > 6 else None
         r, v = state[:3].tolist(), state[3:6].tolist()
         return vector_to_inertial(effect.vector, effect.frame, r, v, attitude)

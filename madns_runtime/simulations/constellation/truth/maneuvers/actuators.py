@@ -28,6 +28,8 @@ STANDARD_GRAVITY_M_S2 = 9.80665
 """By definition; specific impulse in seconds is exhaust velocity over it."""
 DELTA_V_M_S_MIN = 1e-12
 """Less does not show in the last digit of an orbit's velocity."""
+ROUNDING_SHARE = 1e-12
+"""Of a vehicle's mass: so much more than what is left may be asked for by whoever means all of it; 2e-9 m/s."""
 TORQUE_N_M_MIN = 1e-15
 """Less than wheels can give is nothing."""
 DIPOLE_A_M2_MIN = 1e-12
@@ -180,7 +182,7 @@ def fire(
             reason=f"an impulse of {impulse_n_s:.4g} N s, the least is {thruster.minimum_impulse_n_s:g} N s"
         )
     needed_kg = propellant_of(thruster, tank.mass_kg, commanded)
-    if needed_kg > tank.propellant_kg:
+    if needed_kg > tank.propellant_kg + tank.mass_kg * ROUNDING_SHARE:
         return ActuatorRefusal(
             reason=f"needs {needed_kg:.4g} kg of propellant, {tank.propellant_kg:.4g} kg are left"
         )

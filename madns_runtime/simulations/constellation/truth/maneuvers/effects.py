@@ -58,6 +58,17 @@ class Effect:
         """Whether it takes time."""
         return self.end_s > self.start_s
 
+    def moved(self, *, start_s: float | None = None, end_s: float | None = None) -> Effect:
+        """Return it with another beginning or end; what takes no time is moved as a whole."""
+        if not self.is_arc:
+            at_s = next(t_s for t_s in (start_s, end_s, self.at_s) if t_s is not None)
+            return replace(self, at_s=at_s, start_s=at_s, end_s=at_s)
+        return replace(
+            self,
+            start_s=self.start_s if start_s is None else start_s,
+            end_s=self.end_s if end_s is None else end_s,
+        )
+
 
 class Timeline:
     """The effects of one vehicle that truth may still depend on, in order."""
@@ -91,8 +102,11 @@ class Timeline:
         return tuple(e for e in self.effects if e.start_s > t_s or e.end_s > t_s)
 
     def between(self, t0_s: float, t1_s: float) -> tuple[Effect, ...]:
-        """Return those that act within (t0_s, t1_s]."""
-        return tuple(e for e in self.from_time(t0_s) if e.start_s <= t1_s)
+        """Return those that act within (t0_s, t1_s], or later before the middle of a thrust arc that begins by then."""
+        later = self.from_time(t0_s)
+        middles_s = (e.at_s for e in later if e.kind == "thrust" and e.start_s <= t1_s)
+        until_s = max(middles_s, default=t1_s)  # where the arc's axes are taken
+        return tuple(e for e in later if e.start_s <= max(t1_s, until_s))
 
     def ballistic_at(self, t_s: float) -> float:
         """Return the ballistic coefficient from *t_s* on, m^2/kg."""

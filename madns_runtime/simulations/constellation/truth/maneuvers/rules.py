@@ -345,16 +345,15 @@ class ManeuverDesk:
         return self._booked(taken, given)
 
     def _abutting(self, vehicle: int, effect: Effect) -> Effect:
-        """Return a torque or dipole that begins where the one before ends, were it not for the rounding of times."""
-        if effect.kind not in ("torque", "dipole"):
-            return effect
+        """Return an effect that begins or ends where another does on its actuator, were it not for the rounding of times."""
         for other in self._timelines[vehicle].effects:
-            if other.kind != effect.kind:
+            is_one_actuator = ACTUATORS.get(other.kind) == ACTUATORS.get(effect.kind)
+            if not is_one_actuator or not (effect.is_arc or other.is_arc):
                 continue
             if 0.0 < abs(other.end_s - effect.start_s) <= SNAP_S:
-                effect = replace(effect, start_s=other.end_s)
+                effect = effect.moved(start_s=other.end_s)
             if 0.0 < abs(other.start_s - effect.end_s) <= SNAP_S:
-                effect = replace(effect, end_s=other.start_s)
+                effect = effect.moved(end_s=other.start_s)
         return effect
 
     def _busy(self, vehicle: int, effect: Effect) -> str:
@@ -371,7 +370,8 @@ class ManeuverDesk:
         if not isinstance(given, Burn) or thruster is None:
             return taken
         tank, commanded_m_s = self._tanks[taken.vehicle], math.hypot(*taken.command.vector)
-        expected_kg = tank.propellant_kg - propellant_of(thruster, tank.mass_kg, commanded_m_s)
+        needed_kg = propellant_of(thruster, tank.mass_kg, commanded_m_s)
+        expected_kg = max(0.0, tank.propellant_kg - needed_kg)
         effect, now_s = taken.effect, taken.heard_s - taken.command.phase_s
         assert effect is not None
         tank.book(given, effect.start_s, effect.end_s, now_s=now_s)

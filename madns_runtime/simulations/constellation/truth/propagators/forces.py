@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.simulations.constellation.orbit.atmosphere import drag_m_s2
+from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_RADIUS_M_MIN
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
 
 Array = NDArray[np.float64]
@@ -71,7 +72,7 @@ def acceleration_of(parameters: PropagationParameters) -> Acceleration:
     thrust = None if parameters.thrust_m_s2 is None else parameters.thrust_m_s2.T
 
     def acceleration(r: Array, v: Array) -> Array:
-        r2 = np.einsum("in,in->n", r, r)
+        r2 = np.maximum(np.einsum("in,in->n", r, r), GRAVITY_RADIUS_M_MIN**2)
         total = forces[0](r, r2, v, parameters)
         for force in forces[1:]:
             total += force(r, r2, v, parameters)

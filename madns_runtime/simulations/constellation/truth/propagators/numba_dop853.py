@@ -29,10 +29,10 @@ except ImportError as error:
 
 Array = NDArray[np.float64]
 Tables = tuple[Array, Array, Array, Array]
-"""Model (7,), air (4, L), tableau (22, 16), limits (6,): see `numba_propagator`."""
+"""Model (8,), air (4, L), tableau (22, 16), limits (6,): see `numba_propagator`."""
 
-MU, K2, K3, K4, RADIUS, FLATTENING, EARTH_RATE = range(7)
-"""Of the model: mu; mu Jn R^n for n = 2, 3, 4, zero where not in force; radius; flattening; rate."""
+MU, K2, K3, K4, RADIUS, FLATTENING, EARTH_RATE, R_MIN = range(8)
+"""Of the model: mu; mu Jn R^n for n = 2, 3, 4, zero where not in force; radius; flattening; rate; where gravity ends to grow."""
 RTOL, ATOL_M, STEP_S_MAX, FIRST_STEP_RAD, KINK_M_S, KINK_STEP_S_MIN = range(6)
 """Of the limits."""
 STAGES = 12
@@ -71,7 +71,7 @@ def compiled(signature: object) -> Callable[[Function], Function]:
 def derive(y: Array, dy: Array, model: Array, air: Array, vehicle: Array) -> None:
     """Put the derivative of a state (6,) into *dy*; vehicle is ballistic coefficient and thrust (4,)."""
     x, y_, z, vx, vy, vz = y
-    r2 = x * x + y_ * y_ + z * z
+    r2 = max(x * x + y_ * y_ + z * z, model[R_MIN] * model[R_MIN])
     r = math.sqrt(r2)
     sine2 = z * z / r2
     inverse3 = 1.0 / (r2 * r)

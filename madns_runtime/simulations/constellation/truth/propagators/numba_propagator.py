@@ -14,6 +14,7 @@ from madns_runtime.simulations.constellation.orbit import atmosphere
 from madns_runtime.simulations.constellation.orbit.constants import (
     EARTH_FLATTENING,
     EARTH_RATE_RAD_S,
+    GRAVITY_RADIUS_M_MIN,
 )
 from madns_runtime.simulations.constellation.parameters import NumbaPropagator
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
@@ -96,9 +97,8 @@ def model_of(parameters: PropagationParameters) -> Array:
             (4, "j4", gravity.j4),
         )
     )
-    return np.array(
-        (gravity.mu_m3_s2, *zonals, gravity.radius_m, EARTH_FLATTENING, EARTH_RATE_RAD_S)
-    )
+    earth = (gravity.radius_m, EARTH_FLATTENING, EARTH_RATE_RAD_S, GRAVITY_RADIUS_M_MIN)
+    return np.array((gravity.mu_m3_s2, *zonals, *earth))
 
 
 def limits_of(settings: NumbaPropagator) -> Array:
