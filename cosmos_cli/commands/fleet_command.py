@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.fleet.failure import ELSEWHERE_NOW, MachineFailure
 from cosmos_cli.fleet.fleet import Fleet, fleet_of
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
@@ -31,6 +32,7 @@ __all__ = [
     "LimitOption",
     "PresentInventoryOption",
     "SomeInventoryOption",
+    "ask_whether_moved",
     "failure_teller",
     "finish",
     "fleet_of",
@@ -134,6 +136,17 @@ def failure_teller(console: Console) -> Callable[[Outcome[Any]], None]:
             console.say(f"{outcome.machine}: failed: {outcome.failure}")
 
     return tell
+
+
+def ask_whether_moved(
+    console: Console,
+    failures: Iterable[MachineFailure | None],
+    inventory: Sequence[str] | None,
+    words: str,
+) -> None:
+    """Say how to name an inventory to a command, *words*, where machines of runs were not found and it was given none."""
+    if not inventory and any(each and each.kind in ELSEWHERE_NOW for each in failures):
+        console.say(f"at another address by now? cosmos {words} -i FILE")
 
 
 def without_this_computer(console: Console, fleet: Fleet) -> Fleet:
