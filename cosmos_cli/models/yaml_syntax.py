@@ -16,6 +16,9 @@ _ESCAPE = (
     " or put the text in '...'"
 )
 _NO_KEY = "expected a key at the indentation of its neighbours; behind a quoted text stands nothing more on its line"
+_NO_END = (
+    "more follows a value in quotes or brackets that ended before this: put all of it in quotes"
+)
 _NO_COLON = "expected `key: value`, got no ':' after the key"
 NO_SPACE = "expected a space behind this ':'"
 _MEANINGS = (
@@ -38,6 +41,7 @@ _MEANINGS = (
     ),
     ("", "could not find expected ':'", True, _NO_COLON),
     ("", "cannot start any token", False, "{} cannot start a value: put it in quotes"),
+    ("", "expected <document start>", False, _NO_END),
     ("", "maximum nesting depth", False, "expected at most {depth_max} levels of nesting"),
     ("block mapping", "block end", False, _NO_KEY),
     ("block mapping", "expected key", False, _NO_KEY),

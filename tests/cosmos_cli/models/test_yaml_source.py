@@ -138,6 +138,7 @@ def fault_of(text):
         ("a\n b: 2\n", (2, 3), "a key within the text above it: check the indentation"),
         ("a: 1\nbc\n", (2, 1), "expected `key: value`, got no ':' after the key"),
         ("a: [\n", (2, 1), "expected a value, or the bracket that closes what was opened before"),
+        ("[ok] done\n", (1, 6), "more follows a value in quotes or brackets that ended before"),
         ("a: @x\n", (1, 4), "'@' cannot start a value: put it in quotes"),
         ("a: *x\n", (1, 4), "no anchor &x stands above"),
         ("a: &x [*x]\n", (1, 8), "no anchor &x stands above"),
