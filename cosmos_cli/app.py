@@ -186,8 +186,9 @@ def _report_usage(error: Any, wants_json: bool) -> int:
         return int(ExitCode.BAD_INPUT)
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "cosmos"
-    text = f"{error.format_message()}\nsee `{command} --help`"
-    return _report(_plain("usage", error.format_message(), ExitCode.BAD_INPUT), text, wants_json)
+    message = error.format_message().replace(":\n\t", ": ").replace(",\n\t", ", ")  # choices
+    text = f"{message}\nsee `{command} --help`"
+    return _report(_plain("usage", message, ExitCode.BAD_INPUT), text, wants_json)
 
 
 def _report_unexpected(error: Exception, wants_json: bool) -> int:

@@ -59,6 +59,8 @@ class Fault:
     """Position of `column` in `source`, from 0, if that is only a part of the line."""
     override: str = ""
     """KEY when the value came from --set KEY=VALUE."""
+    option: str = ""
+    """What was typed instead of that --set, such as --duration."""
 
     def render(self) -> str:
         """
@@ -94,6 +96,8 @@ class Fault:
         }
 
     def _where(self) -> str:
+        if self.option:
+            return self.option
         if self.override:
             return f"--set {in_one_line(self.override)}"
         file = in_one_line(self.file)

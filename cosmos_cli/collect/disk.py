@@ -5,17 +5,15 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import math
 import os
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.ui.sizes import size_words
 
 READ_BYTES = 1_048_576
-KILO = 1000.0
-UNITS = ("kB", "MB", "GB", "TB")
 SPARE_BYTES = 16 * 1024 * 1024
 """Room that is left on the disk for the run's summary and tables."""
 
@@ -57,14 +55,6 @@ def no_room(folder: Path, what: str | None) -> MachineFailure:
     return MachineFailure(
         FailureKind.DISK_FULL, f"no room on the disk here: {folder}: {what}", "make room here"
     )
-
-
-def size_words(size_bytes: float) -> str:
-    """Return a size for people, such as 17 B, 1.2 kB or 340.5 MB."""
-    if size_bytes < KILO:
-        return f"{size_bytes:.0f} B"
-    power = min(int(math.log(size_bytes, KILO)), len(UNITS))
-    return f"{size_bytes / KILO**power:.1f} {UNITS[power - 1]}"
 
 
 def hash_of(path: Path, size_bytes: int) -> str | None:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from cosmos_cli.collect.disk import size_words
 from cosmos_cli.collect.machine_sources import RecordingMachine
 from cosmos_cli.collect.partial_files import PartialFiles, PartWriter, Transfer
 from cosmos_cli.collect.remote_manifest import Offer, check_offer, shown
@@ -19,6 +18,7 @@ from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Answer, Helper
 from cosmos_cli.onboard.records import FILES_MAX, entry_line
 from cosmos_cli.ui.plural import counted
+from cosmos_cli.ui.sizes import size_words
 from madns_runtime.plain_values import first_few
 
 ROUNDS_MAX = 3

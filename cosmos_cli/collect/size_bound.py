@@ -6,8 +6,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cosmos_cli.collect.disk import size_words
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.ui.sizes import size_words
 from madns_runtime.config import RunConfig
 from madns_runtime.timing.rate import count_ticks
 

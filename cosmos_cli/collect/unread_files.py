@@ -13,11 +13,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cosmos_cli.collect.disk import size_words
 from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.size_bound import recordable_bytes
 from cosmos_cli.evidence.manifest import run_files, unreadable_places
 from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.ui.sizes import size_words
 
 BLOCK_BYTES = 512
 """Unit of `st_blocks` on every file system, bytes."""

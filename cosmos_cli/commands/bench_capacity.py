@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -30,12 +30,22 @@ from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.models.overrides import told_as_options
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from madns_runtime.config import AGENTS_MAX, RATE_HZ_MAX
 
 MINUTES_DEFAULT = 30.0
 MINUTES_MAX = 24 * 60.0
 SECONDS_MAX = 3600.0
+OPTIONS: Final = {
+    "agents.count": "--first",
+    "agents.tick_hz": "--hz",
+    "agents.per_process": "--per-process",
+    "time.duration_s": "--seconds",
+    "deadline.overrun_ms": "--hz",
+    "deadline.max_miss_ratio": "--max-miss-ratio",
+}
+"""By the settings of a trial that they make."""
 
 
 ScenarioArgument = Annotated[
@@ -137,7 +147,8 @@ def capacity(
     settings = set_ or ()
     _refuse_own_settings(settings, trials)
     own = trials.overrides(first)
-    checked = load_scenario(scenario or SCENARIO, [*settings, *own], warn=console.warn)
+    with told_as_options(OPTIONS, settings):
+        checked = load_scenario(scenario or SCENARIO, [*settings, *own], warn=console.warn)
     if checked.scenario.time.is_lockstep:
         raise InputError(
             f"{checked.path}: in lockstep no tick is ever missed, so that any number of agents keeps the budget; try it"

@@ -19,6 +19,7 @@ from cosmos_cli.commands.fleet_command import (
 from cosmos_cli.commands.run_arguments import RunsOption
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.models.overrides import told_as_options
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.plural import counted
 
@@ -62,7 +63,10 @@ def suite(
     some_machines(inventory, limit, host)
     settings = list(set_ or ())
     settings += [] if minutes is None else [f"time.duration_s={minutes * 60!r}"]
-    scenarios = [load_scenario(path, settings, warn=console.warn) for path in suite_files(files)]
+    with told_as_options({"time.duration_s": "--minutes"}, set_ or ()):
+        scenarios = [
+            load_scenario(path, settings, warn=console.warn) for path in suite_files(files)
+        ]
     options = run_arguments(inventory=inventory, limit=limit, host=host, settings=settings)
     total_s = sum(each.scenario.time.duration_s for each in scenarios)
     console.say(f"{counted(len(scenarios), 'run')} of {total_s / 60:.3g} minutes together")

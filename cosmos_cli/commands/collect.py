@@ -19,6 +19,7 @@ from cosmos_cli.commands.fleet_command import (
     AcceptHostKeysOption,
     ForksOption,
     PresentInventoryOption,
+    ask_whether_moved,
 )
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
@@ -26,7 +27,7 @@ from cosmos_cli.evidence.run_directory import RunDirectory, alone, runs_root
 from cosmos_cli.evidence.run_documents import Problem
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.launch.living_processes import by_name, targets_of
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, losing_output
@@ -51,8 +52,6 @@ ForgetOption = Annotated[
         " none: ask all again. Repeatable.",
     ),
 ]
-ELSEWHERE_NOW = (FailureKind.UNREACHABLE, FailureKind.REFUSED, FailureKind.HOST_KEY_CHANGED)
-"""Failures of a machine whose address may be another by now."""
 NOT_ASKED = "its records were not fetched, as --no-retrieve says"
 
 
@@ -102,8 +101,8 @@ def collect(
             due = [each.machine for each in retrieval.due]
             outcomes = _fetch(found, retrieval, progress) if due and retrieve else []
         tell_outcomes(console, [outcome for outcome in outcomes if outcome.machine in due])
-        if not inventory and any(map(_is_not_reached, failed(outcomes))):
-            console.say(f"at another address by now? cosmos collect {found.shell_path} -i FILE")
+        failures = [outcome.failure for outcome in failed(outcomes)]
+        ask_whether_moved(console, failures, inventory, f"collect {found.shell_path}")
         problems = problems_of(outcomes)
         if not retrieve:
             problems = tuple(Problem(machine=name, text=NOT_ASKED, step="collect") for name in due)
@@ -134,10 +133,6 @@ def _forget(run: RunDirectory, names: Sequence[str], console: Console) -> None:
         else:
             again = f"cosmos collect {run.name} --forget {NONE}"
             console.say(f"{machine}: is asked no more; to ask it again: {again}")
-
-
-def _is_not_reached(outcome: Outcome[Retrieved]) -> bool:
-    return outcome.failure is not None and outcome.failure.kind in ELSEWHERE_NOW
 
 
 def _bytes_of(size: str | None) -> int | None:

@@ -53,7 +53,6 @@ COMMANDS = (
     "tabulate",
     "bench",
 )
-INVENTORY_VARIABLE = "COSMOS_INVENTORY"
 GARBAGE_AFTER = 50_000
 """Objects made between two looks for garbage: what is imported later makes many, too."""
 TIMED = (
@@ -164,7 +163,7 @@ def load_command(verb: str) -> Any:
         command.params.append(_verbose_option())
     for parameter in command.params:
         parameter.callback = parameter.callback or _refuse_not_finite
-        if parameter.envvar == INVENTORY_VARIABLE:
+        if parameter.envvar == invocation.INVENTORY_VARIABLE:
             parameter.type = _with_own_split(parameter.type)
     return command
 

@@ -23,6 +23,7 @@ from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.models.overrides import told_as_options
 from cosmos_cli.system.named_file import check_writable, named_file
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.name_ranges import compact
@@ -88,7 +89,8 @@ def diff(
     if len(names) > RUNS_MAX:
         raise InputError(f"expected at most {RUNS_MAX} runs, got {len(names)}")
     if run_first:
-        found, code = _run_all(names, console, folder, overrides=_overrides(set_, duration_s))
+        with told_as_options({"time.duration_s": "--duration"}, set_ or ()):
+            found, code = _run_all(names, console, folder, overrides=_overrides(set_, duration_s))
     elif set_ or duration_s is not None:
         raise InputError(
             "--set and --duration change scenarios; give them with --run A.yaml B.yaml"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from cosmos_cli.commands.fleet_command import (
     ForksOption,
     LimitOption,
     SomeInventoryOption,
+    ask_whether_moved,
     failure_teller,
     where_words,
 )
@@ -124,6 +126,9 @@ def down(
     if not chosen:
         where = where_words(len(outcomes) - len(unasked))
         console.say(f"no run lives {where}{_unasked_words(unasked)}")
+    failures = [outcome.failure for outcome in bad]
+    named = ["--all"] if all_ else runs or []
+    ask_whether_moved(console, failures, inventory, shlex.join(["down", *named]))
     is_left = any(one.is_left for one in ended)
     exit_code = ExitCode.RUN_FAILED if is_left else ExitCode.MACHINES if bad else ExitCode.OK
     retry = offer_retry_of(console, inventory, targets, [outcome.machine for outcome in bad])

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.fleet.failure import ELSEWHERE_NOW, MachineFailure
 from cosmos_cli.fleet.fleet import Fleet, fleet_of
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
@@ -32,6 +33,7 @@ __all__ = [
     "LimitOption",
     "PresentInventoryOption",
     "SomeInventoryOption",
+    "ask_whether_moved",
     "failure_teller",
     "finish",
     "fleet_of",
@@ -149,6 +151,17 @@ def row_teller(
         console.data(f"{outcome.machine:<{width}}  {words(outcome)}")
 
     return tell
+
+
+def ask_whether_moved(
+    console: Console,
+    failures: Iterable[MachineFailure | None],
+    inventory: Sequence[str] | None,
+    words: str,
+) -> None:
+    """Say how to name an inventory to a command, *words*, where machines of runs were not found and it was given none."""
+    if not inventory and any(each and each.kind in ELSEWHERE_NOW for each in failures):
+        console.say(f"at another address by now? cosmos {words} -i FILE")
 
 
 def without_this_computer(console: Console, fleet: Fleet) -> Fleet:

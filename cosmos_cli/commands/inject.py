@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -155,19 +156,29 @@ def _value(action: str, values: Sequence[str]) -> float | None:
 
 
 def _parameters(values: Sequence[str]) -> dict[str, Any]:
-    """Return KEY=VALUE pairs as a mapping; values are read as YAML."""
+    """Return KEY=VALUE pairs as a mapping; values are read as YAML, and as texts if they are none."""
     found: dict[str, Any] = {}
     for each in values:
         if "=" not in each:
             raise InputError(f"expected KEY=VALUE, such as for_s=20, got {each!r}")
         try:
-            key, path, value = parse_override(each)
+            key, path, value = parse_override(_as_yaml(each))
         except InputError as error:  # there is no --set here
             raise InputError(str(error).removeprefix("--set ")) from None
         if len(path) > 1 or key in found:
             raise InputError(f"expected each parameter once, and no dots, got {each!r}")
         found[key] = value
     return found
+
+
+def _as_yaml(given: str) -> str:
+    """Return KEY=VALUE, the value in quotes if it is no YAML, as [ok] done and @home are: it is a text."""
+    key, _, text = given.partition("=")
+    try:
+        parse_override(f"a={text}")
+    except InputError:
+        return f"{key}={json.dumps(text)}"
+    return given
 
 
 def _texts(values: Sequence[str], parameters: Mapping[str, Any]) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import Annotated
 
@@ -10,7 +10,11 @@ import typer
 
 from cosmos_cli.collect.log_follower import LogFollower, sources_elsewhere
 from cosmos_cli.collect.machine_sources import HOST, RecordingMachines
-from cosmos_cli.commands.fleet_command import AcceptHostKeysOption, PresentInventoryOption
+from cosmos_cli.commands.fleet_command import (
+    AcceptHostKeysOption,
+    PresentInventoryOption,
+    ask_whether_moved,
+)
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
@@ -18,6 +22,7 @@ from cosmos_cli.evidence.run_log import LogLine, LogReading, in_order
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.fleet.connection import ConnectOptions
+from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.launch.living_processes import by_name, targets_of
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
@@ -90,15 +95,15 @@ def logs(
         listed=by_name(targets_of(inventory if elsewhere else None, None)),
     )
 
+    failures: list[MachineFailure] = []
+
     def follower() -> LogFollower:
         return LogFollower(
             run=found,
             sources=elsewhere,
             reading=reading,
             options=options,
-            on_failure=lambda machine, failure: console.say(
-                f"{machine}: its log cannot be read: {failure}"
-            ),
+            on_failure=_failure_teller(console, failures),
             failed=failed,
         )
 
@@ -119,10 +124,24 @@ def logs(
             else f"{found.name}: {sources.host_machine}, its host's machine, gives no answer: whether it goes on is not"
             " known; repeat the command when that is back"
         )
+    if failed:
+        ask_whether_moved(console, failures, inventory, f"logs {found.shell_path}")
     is_silent = not printer.count and lines != 0
     machine = sources.machine_of_agent.get(source or "")
     _tell_rest(console, found, reading, level, is_silent=is_silent, machine=machine)
     return int(ExitCode.MACHINES if failed else ExitCode.OK)
+
+
+def _failure_teller(
+    console: Console, failures: list[MachineFailure]
+) -> Callable[[str, MachineFailure], None]:
+    """Return what tells the failure of a machine when it happens, and keeps it."""
+
+    def tell(machine: str, failure: MachineFailure) -> None:
+        failures.append(failure)
+        console.say(f"{machine}: its log cannot be read: {failure}")
+
+    return tell
 
 
 def _by_name(source: str | None, run: RunDirectory, names: Sequence[str]) -> str | None:

@@ -60,7 +60,9 @@ class Action(StrEnum):
 
 def packages(
     inventory: InventoryOption,
-    action: Annotated[Action, typer.Argument(help="What to do.")],
+    action: Annotated[
+        Action, typer.Argument(metavar="ACTION", help="What to do: install, remove or upgrade.")
+    ],
     names: Annotated[
         list[str] | None,
         typer.Argument(metavar="[NAME...]", help="Packages; upgrade without one means all."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from cosmos_cli.commands.fleet_command import (
     ForksOption,
     LimitOption,
     SomeInventoryOption,
+    ask_whether_moved,
     failure_teller,
     where_words,
 )
@@ -113,6 +115,8 @@ def ps(
     if bad:
         unasked = compact(dict.fromkeys(outcome.machine for outcome in bad))
         console.say(f"whether a run lives there is not known: {unasked} could not be asked")
+    failures = [outcome.failure for outcome in bad]
+    ask_whether_moved(console, failures, inventory, shlex.join(["ps", *([run] if run else [])]))
     exit_code = ExitCode.MACHINES if bad else ExitCode.OK
     retry = offer_retry_of(console, inventory, listed, [outcome.machine for outcome in bad])
     console.print_json(

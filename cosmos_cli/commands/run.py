@@ -26,6 +26,7 @@ from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.launch.access import chosen_access
 from cosmos_cli.launch.execute import Detached, RunOptions, execute, plan_of
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.models.overrides import told_as_options
 from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.testing.junit import JunitOption, check_junit, junit_case_of, write_junit
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption, losing_output
@@ -86,7 +87,8 @@ def run(
         forks=forks,
         connecting=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
     )
-    checked = load_scenario(scenario, [*(set_ or ()), *duration], warn=console.warn)
+    with told_as_options({"time.duration_s": "--duration"}, set_ or ()):
+        checked = load_scenario(scenario, [*(set_ or ()), *duration], warn=console.warn)
     if junit is not None and (check or detach):
         raise InputError("--junit writes the verdict: leave out --check and --detach")
     if check:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from cosmos_cli.models.separate_process import (
     Work,
     work_separately,
 )
-from cosmos_cli.ui.console import Console
+from cosmos_cli.ui.console import Console, JsonOption
 from madns_runtime.bounded_files import read_regular_file
 from madns_runtime.config import Timeouts
 from madns_runtime.errors import MadnsError, PluginError
@@ -39,9 +40,10 @@ def schema(
             "--check", help=f"Write nothing; fail if FILE, by default {KEPT}, is not current."
         ),
     ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Print the JSON Schema of scenarios, for completion in editors."""
-    console = Console()
+    console = Console(json=as_json)
     text = _current_schema(console.warn)
     if check and output is None:
         output = KEPT
@@ -49,6 +51,7 @@ def schema(
             raise InputError(f"{output}: no such file here; name the file to check with --output")
     if output is None:
         console.data(text.rstrip("\n"))
+        console.print_json(json.loads(text))
         return
     try:
         refuse_stream_word(output)
@@ -58,7 +61,9 @@ def schema(
             output.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{output}: {error.strerror}") from error
-    console.say(f"{output}: {'current' if check else 'written'}")
+    done = "current" if check else "written"
+    console.print_json({"file": str(output), "status": done, "exit_code": 0})
+    console.say(f"{output}: {done}")
 
 
 def _current_schema(warn: Callable[[str], None]) -> str:

@@ -11,8 +11,10 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.commands.run_arguments import RunsOption
-from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.errors import ExitCode, Fault, InputError
 from cosmos_cli.evidence.run_directory import runs_root, utc_now
+from cosmos_cli.models.overrides import override_steps
+from cosmos_cli.models.test_settings import SECTION
 from cosmos_cli.testing.case import CaseSettings, SuiteCase
 from cosmos_cli.testing.discovery import ChosenCases, FoundScenarios, choose_cases, find_scenarios
 from cosmos_cli.testing.expression import parse_expression
@@ -111,11 +113,12 @@ def test(
     or none is meant, 130 if interrupted.
     """
     console = Console(json=json, quiet=quiet, instead=_instead(junit))
-    if update_baselines and (seeds is not None or full_length):
+    if update_baselines and (seeds is not None or full_length or realtime_s_max is not None):
         raise InputError(
-            "--update-baselines writes figures of the test as it stands: leave out --seeds and"
-            " --full-length"
+            "--update-baselines writes figures of the test as it stands: leave out --seeds,"
+            " --full-length and --realtime-max"
         )
+    _refuse_section(set_ or ())
     settings = CaseSettings(
         overrides=tuple(set_ or ()), is_shortened=not full_length, realtime_s_max=realtime_s_max
     )
@@ -147,6 +150,20 @@ def test(
     finally:  # a disk that is full by now takes no file, and what failed is told all the same
         _tell(console, result, chosen, seconds, code=code)
     return int(code)
+
+
+def _refuse_section(given: Sequence[str]) -> None:
+    """
+    Refuse settings of the section `test`, which is read from the file, before there are any.
+
+    Raises:
+        InputError: There is one: it would change nothing.
+    """
+    for each in given:
+        if override_steps(each)[0] == SECTION:
+            key = each.partition("=")[0]
+            text = "changes nothing: what a scenario is as a test is read from its file alone; write it there"
+            raise InputError(faults=[Fault(text=text, override=key)])
 
 
 def _instead(junit: Path | None) -> str:

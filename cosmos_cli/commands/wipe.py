@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import typer
 
-from cosmos_cli.collect.disk import size_words
 from cosmos_cli.collect.wipe import Order, RunThere, Wiped, carry_out, look, make_order, runs_here
 from cosmos_cli.commands.fleet_command import (
     FORKS_DEFAULT,
@@ -30,6 +29,7 @@ from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption, confirm
 from cosmos_cli.ui.plural import counted
+from cosmos_cli.ui.sizes import size_words
 
 COLUMNS = (
     Column("machine"),

@@ -42,6 +42,10 @@ class FailureKind(StrEnum):
     """COSMoS itself is to blame."""
 
 
+ELSEWHERE_NOW = (FailureKind.UNREACHABLE, FailureKind.REFUSED, FailureKind.HOST_KEY_CHANGED)
+"""Failures of a machine whose address may be another by now."""
+
+
 class MachineFailure(Exception):
     """
     One machine's failure. Others' results are never hidden by it.

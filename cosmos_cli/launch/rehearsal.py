@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cosmos_cli.collect.disk import size_words
 from cosmos_cli.doctor.probe import Responder
 from cosmos_cli.fleet.connection import Connection, ConnectOptions, address_here
 from cosmos_cli.fleet.helper import Helper
@@ -33,6 +32,7 @@ from cosmos_cli.models.machine_facts import NOEXEC_CURE, MachineFacts
 from cosmos_cli.provision import STORE_PARTS
 from cosmos_cli.provision.before_run import Cargo, cargo_of, environment_key_of
 from cosmos_cli.provision.environment import ask_installed, installed_request
+from cosmos_cli.ui.sizes import size_words
 from madns_runtime.timing.rate import count_ticks
 
 PARTS = (

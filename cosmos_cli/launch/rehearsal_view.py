@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from cosmos_cli.collect.disk import size_words
 from cosmos_cli.errors import CosmosError, ExitCode
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.fleet import Fleet
@@ -39,6 +38,7 @@ from cosmos_cli.provision.up import FleetUp, UpOptions
 from cosmos_cli.provision.up_view import UpView
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.plural import counted
+from cosmos_cli.ui.sizes import size_words
 from madns_runtime.errors import MadnsError
 
 COLUMNS = (

@@ -25,6 +25,7 @@ from cosmos_cli.provision.driver_files import drivers_by_machine
 from cosmos_cli.provision.environment import ask_installed, installed_request
 from cosmos_cli.provision.trees import runtime_tree, send_tree
 from cosmos_cli.provision.wheelhouse import EnvironmentNeed, remembered_key
+from cosmos_cli.ui import invocation
 from cosmos_cli.ui.foreign_text import clean_text
 from madns_runtime.config import DeviceLaunch, Timeouts, to_mapping
 from madns_runtime.plugin.registry import is_file
@@ -169,7 +170,7 @@ class MachineSampler:
             raise MachineFailure(
                 FailureKind.STEP,
                 "the Python packages that its devices need are not installed there, or no longer whole",
-                "run `cosmos up -i INVENTORY` first",
+                f"run `cosmos up{invocation.current().machine_options}` first",
             )
         for tree in trees:
             if not found.trees[tree.hash]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from cosmos_cli.errors import Fault, InputError
@@ -16,6 +18,39 @@ _STEP = re.compile(r"([^.\[\]]+)|\[([0-9]{1,9})\]")
 _INDEX = re.compile(r"[0-9]{1,9}")
 KEY_FORM = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\])*")
 """A dotted path, such as agents.names[0]."""
+GIVEN_TWICE = "is given twice, and only one could count"
+
+
+@contextlib.contextmanager
+def told_as_options(options: Mapping[str, str], given: Sequence[str]) -> Iterator[None]:
+    """
+    Name in faults the option that set a value, such as --duration, instead of a --set that nobody typed.
+
+    Args:
+        options: The command's options, by the keys that they set.
+        given: KEY=VALUE of --set; a key that stands there as well is left as it was typed.
+
+    Raises:
+        InputError: As within.
+    """
+    try:
+        yield
+    except InputError as error:
+        typed = {override_steps(each) for each in given}
+        faults = [_told_as_option(fault, options, typed) for fault in error.faults]
+        if faults == list(error.faults):
+            raise
+        raise InputError(faults=faults, omitted=error.omitted) from error
+
+
+def _told_as_option(fault: Fault, options: Mapping[str, str], typed: set[tuple[str, ...]]) -> Fault:
+    option = options.get(fault.override)
+    if option is None:
+        return fault
+    if tuple(fault.override.split(".")) not in typed:
+        return replace(fault, option=option)
+    is_twice = fault.text == GIVEN_TWICE
+    return replace(fault, text=f"{fault.text} ({option} sets it, too)") if is_twice else fault
 
 
 def apply_overrides(document: Document, overrides: Sequence[str]) -> list[Fault]:
@@ -47,8 +82,7 @@ def _refuse_replacing(key: str, path: Path, seen: dict[tuple[str, ...], str]) ->
     steps = tuple(map(str, path))
     for other, other_key in seen.items():
         if other == steps:
-            also = " (--duration sets it, too)" if key == "time.duration_s" else ""
-            raise _override_error(key, f"is given twice, and only one could count{also}")
+            raise _override_error(key, GIVEN_TWICE)
         if other[: len(steps)] == steps:
             raise _override_error(key, f"would replace what --set {other_key} says; give it first")
     seen[steps] = key

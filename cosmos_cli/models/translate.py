@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -57,6 +58,8 @@ HINTS_MAX = 2 * FAULTS_SHOWN_MAX
 _PATTERNS = {NAME_PATTERN: "lower-case letters, digits and hyphens"}
 _MISSING = ("missing", "missing_argument", "missing_keyword_only_argument")
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+_UNSEEN = re.compile("[\xa0\xad\u2000-\u200f\u202f\u205f\u2060\u3000\ufeff]")
+"""Spaces of other kinds, and what has no width: pages and word processors bring them along."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -237,7 +240,10 @@ def _fault(
     if kind in _UNKNOWN:
         inner = path[len(below) : -1]
         known = known_keys(model, inner, member=item.member) if has_hints else []
+        unseen = _UNSEEN.search(str(path[-1]))
         hint = did_you_mean(str(path[-1]), known)
+        if unseen:
+            hint = f": it holds U+{ord(unseen[0]):04X}, which looks like a space or like nothing; type the key anew"
         return document.fault(path, f"unknown key{hint}", at_key=True)
     value, written = item.error["input"], document.texts.get(path)
     got = written if written and not isinstance(value, str) else kind_of(value)

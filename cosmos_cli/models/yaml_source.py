@@ -8,6 +8,7 @@ without a bound: a file of 200,000 brackets would end the process.
 
 from __future__ import annotations
 
+import codecs
 import math
 import re
 from collections.abc import Iterator
@@ -18,9 +19,12 @@ from typing import Any
 import yaml
 
 from cosmos_cli.errors import Fault, InputError, check_path_is_text
+from cosmos_cli.models.yaml_syntax import plain_words
 from madns_runtime.bounded_files import FileRefused, read_regular_file
 from madns_runtime.similar_words import most_similar
 
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""Beginnings of files that some editors of Windows and its shell write."""
 FILE_BYTES_MAX = 4 * 1024 * 1024
 DEPTH_MAX = 64
 DIGITS_MAX = 300
@@ -52,44 +56,11 @@ _WORDS: dict[str, bool | None] = {
     "False": False,
     "FALSE": False,
 }
-_FLOW_MARKS = re.compile(r"""\$\{|["'\[\]{},:]""")
-"""In a line of a flow mapping or list: what begins or ends a plain text, and a variable."""
 _SEPARATORS = "\x85\u2028\u2029"
 """Ends of lines to the parser (YAML 1.1), and letters to YAML 1.2, to editors and to whoever counts lines."""
 _PRIVATE = (*range(0xE000, 0xF900), *range(0xF0000, 0xFFFFE))
 """Characters without a meaning, which stand for them while the parser reads."""
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-
-_ESCAPE = (
-    'expected an escape such as \\n after the backslash: within "..." write \\\\ for a backslash itself,'
-    " or put the text in '...'"
-)
-_NO_KEY = "expected a key at the indentation of its neighbours; behind a quoted text stands nothing more on its line"
-_MEANINGS = (
-    ("quoted scalar", "escape", False, _ESCAPE),
-    ("quoted scalar", "hexdecimal", False, _ESCAPE),
-    ("quoted scalar", "", True, "this quoted text is never closed"),
-    ("flow sequence", "", True, "this list is never closed: expected ',' or ']'"),
-    ("flow mapping", "", True, "this mapping is never closed: expected ',' or '}}'"),
-    (
-        "",
-        "expected node content",
-        False,
-        "expected a value, or the bracket that closes what was opened before",
-    ),
-    (
-        "",
-        "mapping values are not allowed",
-        False,
-        "a second ': ' on this line: put the text in quotes, or check the indentation",
-    ),
-    ("", "could not find expected ':'", True, "expected `key: value`, got no ':' after the key"),
-    ("", "cannot start any token", False, "{} cannot start a value: put it in quotes"),
-    ("", "maximum nesting depth", False, f"expected at most {DEPTH_MAX} levels of nesting"),
-    ("block mapping", "block end", False, _NO_KEY),
-    ("block mapping", "expected key", False, _NO_KEY),
-)
-"""The parser's terms: within what, which problem, whether the fault is where that began, and what it means."""
 
 Scalar = str | int | float | bool | None
 
@@ -145,6 +116,8 @@ def read_source(path: Path) -> YamlSource:
     except OSError as error:
         raise _whole(label, f"cannot be read: {error.strerror}") from error
     check_path_is_text(path)
+    if raw.startswith(UTF_16):
+        raise _whole(label, "expected UTF-8 text, got UTF-16: save it as UTF-8 in your editor")
     if b"\0" in raw:
         raise _whole(label, "expected UTF-8 text, got binary data")
     try:
@@ -345,45 +318,7 @@ _Dumper.add_representer(str, _Dumper.represent_text)
 
 
 def _syntax_fault(source: YamlSource, error: yaml.MarkedYAMLError) -> Fault:
-    """Say in plain words what the parser's terms mean."""
-    context, problem = error.context or "", error.problem or "not understood"
-    mark = error.problem_mark or error.context_mark
-    if mark is None:
-        return Fault(text=f"not valid YAML: {problem}", file=source.label)
-    line = source.lines[mark.line] if mark.line < len(source.lines) else ""
-    text = f"not valid YAML: {problem}"
-    if line[mark.column : mark.column + 1] == "\t" or line[: mark.column].strip(" ").startswith(
-        "\t"
-    ):
-        text = "expected spaces, got a tab: YAML is indented with spaces"
-    elif "flow" in context and (bare := _bare_variable(line)) is not None:
-        text = "a brace within braces or brackets: put ${...} in quotes"
-        return source.fault(text, line=mark.line + 1, column=bare + 1)
-    else:
-        for in_context, in_problem, is_at_start, meaning in _MEANINGS:
-            if in_context in context and in_problem in problem:
-                text = meaning.format(repr(line[mark.column : mark.column + 1]))
-                begin = error.context_mark or mark
-                if in_context.startswith("flow") and line[mark.column :].strip():  # more follows
-                    text, is_at_start = _without_comma(text, begin.line, mark.line)
-                mark = begin if is_at_start else mark
-                break
-    return source.fault(text, line=mark.line + 1, column=mark.column + 1)
-
-
-def _without_comma(text: str, begin: int, line: int) -> tuple[str, bool]:
-    """Return what a flow list or mapping lacks that *text* calls never closed though more follows, and whether the fault is at its begin."""
-    never, _, expected = text.partition(": ")
-    if line == begin:
-        return f"{expected} before this", False
-    return f"{never}, or has no comma before line {line + 1}: {expected}", True
-
-
-def _bare_variable(line: str) -> int | None:
-    """Return where in a line of a flow mapping or list the first ${ is that no quote keeps: there a plain text ends."""
-    is_plain = False
-    for mark in _FLOW_MARKS.finditer(line):
-        if mark[0] == "${" and is_plain:
-            return mark.start()
-        is_plain = mark[0] in ("${", "[", "{", ",", ":")
-    return None
+    place, text = plain_words(source.lines, error, depth_max=DEPTH_MAX)
+    if place is None:
+        return Fault(text=text, file=source.label)
+    return source.fault(text, line=place[0], column=place[1])

@@ -7,6 +7,7 @@ sent when they are not there yet, so that an edit of flight software needs no `u
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -22,6 +23,7 @@ from cosmos_cli.provision.environment import ask_installed, installed_request
 from cosmos_cli.provision.trees import Tree, runtime_tree, scenario_tree, send_tree
 from cosmos_cli.provision.wheelhouse import EnvironmentNeed, environment_key
 from cosmos_cli.provision.wheels import with_own_wheels
+from cosmos_cli.ui import invocation
 
 BASE_VARIABLE = "COSMOS_BASE_DIRECTORY"
 DRIVERS_VARIABLE = "COSMOS_DRIVER_DIRECTORY"
@@ -137,11 +139,12 @@ def make_ready(
         ),
     )
     if not found.environments[key]:
+        machines = invocation.current().machine_options
         as_host = f" --host {target.name}" if is_host else ""
         raise MachineFailure(
             FailureKind.STEP,
             "the Python packages that the run needs are not installed there, or no longer whole",
-            f"run `cosmos up -i INVENTORY{as_host} {cargo.scenario_path}` first",
+            f"run `cosmos up{machines}{as_host} {shlex.quote(cargo.scenario_path)}` first",
         )
     for tree in trees:
         if not found.trees[tree.hash]:

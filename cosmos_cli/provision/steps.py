@@ -19,6 +19,7 @@ from cosmos_cli.provision.environment import installed_request
 from cosmos_cli.provision.inventory_steps import declared_steps, package_step
 from cosmos_cli.provision.settings import setting_steps
 from cosmos_cli.provision.step import Kind, Step, StepRequest
+from cosmos_cli.ui.sizes import size_words
 from madns_runtime.plain_values import first_few
 
 RESERVE_BYTES = 16_000_000
@@ -85,11 +86,11 @@ def check_possible(facts: MachineFacts, steps: tuple[Step, ...]) -> None:
     freed_bytes = facts.prunable_bytes if freeing else 0
     only_frees = len(freeing) == len(steps)  # a full disk is a reason for it
     if needed_bytes > disk.free_bytes + freed_bytes and not only_frees:
-        also = f", and pruning frees {megabytes(freed_bytes)}" if freed_bytes else ""
+        also = f", and pruning frees {size_words(freed_bytes)}" if freed_bytes else ""
         raise MachineFailure(
             FailureKind.DISK_FULL,
-            f"about {megabytes(needed_bytes)} are needed on {disk.path},"
-            f" {megabytes(disk.free_bytes)} are free{also}",
+            f"about {size_words(needed_bytes)} are needed on {disk.path},"
+            f" {size_words(disk.free_bytes)} are free{also}",
             "make room there (`cosmos wipe` removes runs that were collected), or move cosmos_root",
         )
     rooted = [step.title for step in steps if step.needs_root]
@@ -109,11 +110,6 @@ def _root_refusal(facts: MachineFacts) -> tuple[str, str]:
         "let the user run sudo without one (a file in /etc/sudoers.d), or take what needs root"
         " out of the inventory",
     )
-
-
-def megabytes(size_bytes: int) -> str:
-    """Return a size such as 214 MB."""
-    return f"{size_bytes / 1e6:.0f} MB"
 
 
 def _directories(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
@@ -212,7 +208,7 @@ def _disk_note(facts: MachineFacts) -> Iterator[str]:
     disk = facts.disk
     if disk.free_bytes < RESERVE_BYTES:
         yield (
-            f"{megabytes(disk.free_bytes)} are free on {disk.path}: records of a run will not find room;"
+            f"{size_words(disk.free_bytes)} are free on {disk.path}: records of a run will not find room;"
             " make some there (`cosmos wipe` removes runs that were collected), or move cosmos_root"
         )
 

@@ -1,11 +1,14 @@
-"""The command line that is being carried out, so that a command can say how to repeat it for some of the machines."""
+"""The command line that is being carried out, so that a command can say how to repeat it, or which other one helps."""
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+INVENTORY = ("--inventory", "-i")
+INVENTORY_VARIABLE = "COSMOS_INVENTORY"
 LIMIT = ("--limit", "-l")
 
 
@@ -36,6 +39,33 @@ class Invocation:
             if option in self.valued and not is_attached:
                 next(words, None)
         return False
+
+    @property
+    def machine_options(self) -> str:
+        """
+        Return -i and --limit as they were typed, each behind a space, for another command on these machines.
+
+        Of COSMOS_INVENTORY nothing, as the other command reads it, too; INVENTORY where nobody named any.
+        """
+        inventories, limits = self._values_of(INVENTORY), self._values_of(LIMIT)
+        if not inventories and not os.environ.get(INVENTORY_VARIABLE):
+            inventories = ["INVENTORY"]
+        words = [f" -i {shlex.quote(each)}" for each in inventories]
+        return "".join(words + [f" --limit {shlex.quote(each)}" for each in limits])
+
+    def _values_of(self, names: Sequence[str]) -> list[str]:
+        """Return the values that an option was given."""
+        words, values = iter(self.words), []
+        for word in words:
+            if word == "--" or (self.has_tail and not word.startswith("-")):
+                break
+            flags, name, is_attached = self._options(word)
+            if name not in self.valued:
+                continue
+            start = len(name) + 1 if word.startswith("--") else max(len(flags), 1) + 1
+            value = word[start:] if is_attached else next(words, "")
+            values += [value] if name in names else []
+        return values
 
     def _without_limit(self) -> Iterator[str]:
         words = iter(self.words)

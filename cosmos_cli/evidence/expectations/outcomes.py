@@ -26,6 +26,8 @@ class ExpectationOutcome:
     """Place of its record, where others may come after it."""
     why: str = ""
     """Why there is none, if that is known."""
+    latest_s: float | None = None
+    """Until when an event had to come, s, of this agent; None for any time of the run."""
 
 
 def outcome_of_event(
@@ -52,7 +54,8 @@ def outcome_of_event(
     if after is not None:
         other = after.get(agent) or _of_owner(after, agent) or after.get(HOST) or _only(after)
         if other is None or other.t_s is None:
-            return ExpectationOutcome(got=0.0 if must_not else None, t_s=None, passed=must_not)
+            got = 0.0 if must_not else None
+            return ExpectationOutcome(got=got, t_s=None, passed=must_not, latest_s=latest_s)
         begin_s = other.t_s
         if is_same_stream and agent in after and other.place is not None:
             behind = other.place
@@ -63,14 +66,16 @@ def outcome_of_event(
     wrong = [t_s for t_s, _ in later if latest_s is None or t_s <= latest_s]
     if not wrong and found.is_open_at(latest_s):
         why = f"it occurs {found.count} times, and the first {len(found.found)} are looked at"
-        return ExpectationOutcome(got=None, t_s=None, passed=False, why=why)
+        return ExpectationOutcome(got=None, t_s=None, passed=False, why=why, latest_s=latest_s)
     if must_not:
         return ExpectationOutcome(got=len(wrong), t_s=min(wrong, default=None), passed=not wrong)
     if not later:
-        return ExpectationOutcome(got=None, t_s=None, passed=False)
+        return ExpectationOutcome(got=None, t_s=None, passed=False, latest_s=latest_s)
     first_s, place = min(later)
     is_in_time = latest_s is None or first_s <= latest_s
-    return ExpectationOutcome(got=first_s, t_s=first_s, passed=is_in_time, place=place)
+    return ExpectationOutcome(
+        got=first_s, t_s=first_s, passed=is_in_time, place=place, latest_s=latest_s
+    )
 
 
 def _of_owner(outcomes: Mapping[str, ExpectationOutcome], name: str) -> ExpectationOutcome | None:
@@ -97,7 +102,7 @@ def worst_result(
     broken = sum(not each.passed for each in outcomes.values())
     return CheckResult(
         name=expectation.name,
-        limit=_nearest_limit(expectation, worst.got, duration_s),
+        limit=_nearest_limit(expectation, worst, duration_s),
         got=worst.got,
         passed=worst.passed,
         worst=agent,
@@ -113,7 +118,9 @@ def _badness(expectation: Expectation, outcome: ExpectationOutcome) -> tuple[boo
     if outcome.got is None:
         return not outcome.passed, math.inf
     if expectation.event:
-        sign = -1.0 if outcome.passed and expectation.must == "not_occur" else 1.0
+        if expectation.must == "occur":
+            return not outcome.passed, outcome.got - (outcome.latest_s or 0.0)
+        sign = -1.0 if outcome.passed else 1.0
         return not outcome.passed, sign * outcome.got
     bounds = expectation.bounds
     if bounds.text is not None:
@@ -123,11 +130,18 @@ def _badness(expectation: Expectation, outcome: ExpectationOutcome) -> tuple[boo
     return not outcome.passed, max(low, high)
 
 
-def _nearest_limit(expectation: Expectation, got: float | None, duration_s: float) -> float:
-    """Return the bound that is broken or nearest; of an event its latest time, or no occurrence, of a text none unlike it."""
-    bounds = expectation.bounds
+def _nearest_limit(
+    expectation: Expectation, outcome: ExpectationOutcome, duration_s: float
+) -> float:
+    """
+    Return the bound that is broken or nearest; of an event its latest time, or no occurrence, of a text none unlike it.
+
+    An event without a latest time may also come in the last moments of a run, past the end of its ticks.
+    """
+    bounds, got = expectation.bounds, outcome.got
     if expectation.event and expectation.must == "occur":
-        return duration_s if expectation.to_s is None else expectation.to_s
+        at_end_s = duration_s if got is None else max(duration_s, got)
+        return at_end_s if outcome.latest_s is None else outcome.latest_s
     if expectation.event or bounds.text is not None:
         return 0.0
     if bounds.low is None or bounds.high is None or got is None:

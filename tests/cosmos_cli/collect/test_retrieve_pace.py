@@ -2,7 +2,6 @@
 
 import pytest
 
-from cosmos_cli.collect.disk import size_words
 from cosmos_cli.onboard.records import PackingTrial
 
 
@@ -31,11 +30,3 @@ def test_a_link_that_changes_is_tried_anew():
     found = ways(pace, PackingTrial.SETTLED_PIECES, packed_s=1.0, plain_s=9.0)
 
     assert found[-1] is True
-
-
-@pytest.mark.parametrize(
-    ("size_bytes", "words"),
-    [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (2_345_678, "2.3 MB"), (7e15, "7000.0 TB")],
-)
-def test_sizes_are_told_in_a_fitting_unit(size_bytes, words):
-    assert size_words(size_bytes) == words

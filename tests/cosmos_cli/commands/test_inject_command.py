@@ -46,6 +46,20 @@ def test_what_an_agent_may_yet_refuse_is_not_told_as_in_force(
     assert ("tells so in its own events" in err) is is_carried_out_by_agents
 
 
+@pytest.mark.usefixtures("ordered")
+@pytest.mark.parametrize("text", ["[ok] done", "@home", "100%: it's done", "'", "a: b", "% left"])
+def test_a_text_that_is_no_yaml_is_taken_as_it_was_typed(monkeypatch, text):
+    orders = []
+    answer = {"refusal": ""}
+    monkeypatch.setattr(
+        module, "order_action", lambda path, name, order: orders.append(order) or answer
+    )
+
+    assert inject("last", "run", "annotate", f"text={text}") == 0
+    (order,) = orders
+    assert text in (order["parameters"]["text"], order["texts"].get("text"))
+
+
 @pytest.mark.parametrize(
     ("target", "agents"),
     [

@@ -420,6 +420,20 @@ def test_surprise_at_a_machine_is_its_failure_and_all_else_is_told(elsewhere, ca
     assert "host 5" in told.out
 
 
+def test_machine_that_is_not_found_may_have_moved(elsewhere, capsys, monkeypatch, tmp_path):
+    def connect(target, options):
+        raise MachineFailure(FailureKind.REFUSED, "nobody listens")
+
+    monkeypatch.setattr(log_follower, "connect", connect)
+    inventory = tmp_path / "i.yaml"
+    inventory.write_text("all: {hosts: {pi01: {ansible_host: 192.0.2.3}}}\n")
+
+    assert cosmos(["logs"]) == 3
+    assert f"at another address by now? cosmos logs {elsewhere} -i FILE" in capsys.readouterr().err
+    assert cosmos(["logs", "-i", str(inventory)]) == 3
+    assert "at another address" not in capsys.readouterr().err
+
+
 def fails_first(*failures):
     """Return what asks a machine: it fails so often, then tells one line and that the run has ended."""
     coming = list(failures)

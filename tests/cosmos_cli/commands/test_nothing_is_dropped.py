@@ -78,6 +78,25 @@ def test_duration_and_a_set_duration_are_refused(scenario, capsys):
 
 
 @pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (["run", "s.yaml", "--duration", "-1"], "--duration"),
+        (["diff", "--run", "s.yaml", "s.yaml", "--duration", "0"], "--duration"),
+        (["bench", "suite", "s.yaml", "--minutes", "0.01"], "--minutes"),
+    ],
+)
+def test_fault_of_a_value_names_the_option_that_was_typed(scenario, capsys, words, option):
+    """And not the --set that it stands for."""
+    scenario.write_text(SCENARIO.replace("tick_hz: 10", "tick_hz: 1"))
+
+    assert app.run(words) == 2
+
+    told = capsys.readouterr().err
+    assert f"{option}: expected" in told
+    assert "--set" not in told
+
+
+@pytest.mark.parametrize(
     ("words", "told"),
     [
         (["down", "3", "--all"], "--all ends every living run, not only 3"),

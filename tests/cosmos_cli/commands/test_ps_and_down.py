@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from harness.ports import free_port
@@ -18,6 +19,7 @@ from harness.waiting import is_alive, wait_until
 from cosmos_cli.app import run as cosmos
 from cosmos_cli.commands.ps import age_words
 from cosmos_cli.evidence.run_index import remember_run
+from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.living_processes import (
@@ -263,6 +265,26 @@ def test_down_reaches_machines_of_runs_where_the_inventory_has_them_by_now(
     assert cosmos(["down", "1", "-i", machine_list(tmp_path)]) == 0
 
     assert set(listed) == {"192.0.2.3"}
+
+
+@pytest.mark.parametrize("words", [["ps"], ["ps", "1"], ["down", "1"], ["down", "--all"]])
+def test_machine_of_a_run_that_is_not_found_may_have_moved(
+    planned: list[list[str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+) -> None:
+    gone = MachineFailure(FailureKind.UNREACHABLE, "no answer")
+    outcomes: list[Outcome[Any]] = [Outcome(machine="pi01", failure=gone)]
+    monkeypatch.setattr(Fleetwide, "look", lambda fleet, targets: outcomes if [*targets] else [])
+    monkeypatch.setattr(Fleetwide, "end", lambda fleet, sources, **_: outcomes)
+    hint = f"at another address by now? cosmos {' '.join(words)} -i FILE\n"
+
+    assert cosmos(words) == 3
+    assert hint in capsys.readouterr().err
+    assert cosmos([*words, "-i", machine_list(tmp_path)]) == 3
+    assert "at another address" not in capsys.readouterr().err
 
 
 def machine_list(tmp_path: Path) -> str:

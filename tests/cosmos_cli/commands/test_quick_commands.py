@@ -150,6 +150,22 @@ def test_faults_are_json_on_stdout_too(cosmos):
 
 
 @pytest.mark.slow
+def test_schema_with_json_is_the_schema_and_what_was_done_a_document(cosmos):
+    assert cosmos("schema", "--json")[1] == cosmos("schema")[1]
+
+    assert json.loads(cosmos("schema", "-o", "s.json", "--json")[1])["status"] == "written"
+    code, out, _ = cosmos("schema", "-o", "s.json", "--check", "--json")
+
+    assert (code, json.loads(out)) == (0, {"file": "s.json", "status": "current", "exit_code": 0})
+
+
+def test_missing_choice_is_named_as_in_the_help_on_one_line(cosmos):
+    code, _, err = cosmos("packages", "-i", "pi01,")
+
+    words = "error: Missing argument 'ACTION'. Choose from: install, remove, upgrade\n"
+    assert (code, err) == (2, f"{words}see `cosmos packages --help`\n")
+
+
 def test_schema_is_printed_written_and_checked(cosmos):
     _, out, _ = cosmos("schema")
     assert cosmos("schema", "-o", "s.json")[0] == 0

@@ -373,9 +373,27 @@ def test_events_are_judged_in_their_order_and_within_a_time():
     timely = judge(done, expect(**after, agents=("a",), within_s=4.0)).results[1]
     nothing = judge(done, expect(**after, agents=("b",))).results[1]
 
-    assert (late.passed, late.got) == (False, 9.0)
-    assert timely.passed
+    assert (late.passed, late.got, late.limit) == (False, 9.0, 8.0)
+    assert (timely.passed, timely.limit) == (True, 9.0)
     assert (nothing.passed, nothing.got) == (False, None)
+
+
+def test_the_limit_of_an_event_is_what_it_is_held_to():
+    """It may come past the last tick, and after another each agent has its own latest time."""
+    burn = {"stream": "events", "field": "event", "event": "burn"}
+    at_end = events_of("burn", t_s=[DURATION_S + 0.105])
+    (alone,) = judge(expect(**burn, agents=("a",)), tables=at_end).results
+    columns = {"a": ([10.0, 14.0], ["done", "burn"]), "b": ([50.0, 51.0], ["done", "burn"])}
+    sources = {
+        name: {"t_s": np.array(t_s), "event": objects(words), "details": objects([None] * 2)}
+        for name, (t_s, words) in columns.items()
+    }
+    tables = {"events": FakeTable("events", EVENTS.fields, sources)}
+    done = expect(name="done", stream="events", field="event", event="done")
+    after = judge(done, expect(**burn, after="done", within_s=5.0), tables=tables).results[1]
+
+    assert (alone.passed, alone.got, alone.limit) == (True, 100.105, 100.105)
+    assert (after.passed, after.agent, after.got, after.limit) == (True, "a", 14.0, 15.0)
 
 
 def events_of(*words, t_s=None):

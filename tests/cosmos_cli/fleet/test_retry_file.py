@@ -136,6 +136,28 @@ def test_limit_of_a_command_line_is_replaced(words, rest):
     assert shlex.split(invocation.with_limit("@f")) == ["cosmos", "up", "--limit", "@f", *rest]
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["-i", "a b", "-i", "c", "s.yaml"], " -i 'a b' -i c"),
+        (["--inventory=a", "-l", "x:!y"], " -i a --limit 'x:!y'"),
+        (["-qia", "--timeout", "-i", "-lx"], " -i a --limit x"),
+        (["-qi", "a", "--", "-i", "b"], " -i a"),
+        (["s.yaml"], " -i INVENTORY"),
+    ],
+)
+def test_machines_of_a_command_line_are_told_to_another(words, told, monkeypatch):
+    monkeypatch.delenv("COSMOS_INVENTORY", raising=False)
+
+    assert Invocation(verb="up", words=tuple(words), valued=VALUED).machine_options == told
+
+
+def test_inventory_that_the_environment_names_is_not_told(monkeypatch):
+    monkeypatch.setenv("COSMOS_INVENTORY", "a.yaml")
+
+    assert Invocation(verb="run", words=("s.yaml",), valued=VALUED).machine_options == ""
+
+
 def test_limit_behind_bundled_options_is_replaced_before_words_for_machines():
     words = ("-qi", "a", "-l", "x", "ls", "-l", "x")
     invocation = Invocation(verb="exec", words=words, valued=VALUED, has_tail=True)

@@ -172,6 +172,11 @@ MISTAKES = [
         "per_process, restarts_max",
     ),
     (
+        "agents: {count: 3, \u00a0tick_hz: 10}",
+        "a.yaml:3:20: agents.\u00a0tick_hz: unknown key: it holds U+00A0, which looks like a space or like"
+        " nothing; type the key anew",
+    ),
+    (
         "agents: {count: 3, names: [a, b]}",
         "a.yaml:3:27: agents.names: expected 3 names (agents.count), got 2",
     ),

@@ -130,9 +130,15 @@ def fault_of(text):
         ("a: {b: 1\n", (1, 4), "this mapping is never closed"),
         ("a:\n\tb: 1\n", (2, 1), "expected spaces, got a tab"),
         ("a: b: c\n", (1, 5), "a second ': ' on this line"),
-        ("a: 1\n b: 2\n", (2, 3), "a second ': ' on this line"),
+        ("a: 1\n b: 2\n", (2, 3), "this key is indented further than line 1, whose value ends"),
+        ("a:\n  b:3\n\n  c: 1\n", (2, 4), "expected a space behind this ':'"),
+        ("a:\n  - b:3\n    c: 1\n", (2, 6), "expected a space behind this ':'"),
+        ("a: 1\nb:3\nc: 1\n", (2, 2), "expected a space behind this ':'"),
+        ("a: 1\nhttp://x\nc: 1\n", (2, 1), "expected `key: value`, got no ':' after the key"),
+        ("a\n b: 2\n", (2, 3), "a key within the text above it: check the indentation"),
         ("a: 1\nbc\n", (2, 1), "expected `key: value`, got no ':' after the key"),
         ("a: [\n", (2, 1), "expected a value, or the bracket that closes what was opened before"),
+        ("[ok] done\n", (1, 6), "more follows a value in quotes or brackets that ended before"),
         ("a: @x\n", (1, 4), "'@' cannot start a value: put it in quotes"),
         ("a: *x\n", (1, 4), "no anchor &x stands above"),
         ("a: &x [*x]\n", (1, 8), "no anchor &x stands above"),
@@ -257,6 +263,15 @@ def test_binary_file_is_refused(tmp_path):
     path.write_bytes(b"PK\x03\x04\0\0")
 
     assert whole_fault(path) == f"{path}: expected UTF-8 text, got binary data"
+
+
+@pytest.mark.parametrize("coding", ["utf-16", "utf-16-be"])
+def test_file_of_another_coding_is_refused_with_its_cure(tmp_path, coding):
+    path = tmp_path / "a.yaml"
+    path.write_bytes("\ufeffa: 1\n".removeprefix("\ufeff" * (coding == "utf-16")).encode(coding))
+
+    expected = "expected UTF-8 text, got UTF-16: save it as UTF-8 in your editor"
+    assert whole_fault(path) == f"{path}: {expected}"
 
 
 def test_other_encoding_is_refused_with_its_line(tmp_path):

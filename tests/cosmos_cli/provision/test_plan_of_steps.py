@@ -194,7 +194,7 @@ def test_full_disk_is_refused_before_anything_is_sent():
 
     assert refused(steps, disk={"free_bytes": needed - 1}) == (
         "disk_full",
-        "about 116 MB are needed on /home/pi, 116 MB are free",
+        "about 116.0 MB are needed on /home/pi, 116.0 MB are free",
     )
 
 
@@ -235,7 +235,8 @@ def test_full_disk_is_pruned_where_nothing_else_is_to_be_done():
 
     check_possible(facts_of(disk={"free_bytes": 500_000}), (prune,))
 
-    assert refused((*ROOTLESS, prune), disk={"free_bytes": 500_000})[0] == "disk_full"
+    kind, text = refused((*ROOTLESS, prune), disk={"free_bytes": 520_192})
+    assert (kind, text.endswith(", 520.2 kB are free")) == ("disk_full", True)
 
 
 def test_read_only_disk_and_foreign_folder_are_refused():
@@ -277,7 +278,11 @@ def test_slow_answer_makes_no_clock_wrong():
         ({"clock": {"utc_s": 1000.5 + 30}}, {}, ("30 s ahead of this computer's",)),
         ({"throttled": 0x50005}, {}, ("its supply voltage is too low and it is throttled",)),
         ({"throttled": 0x50000}, {}, ()),
-        ({"disk": {"free_bytes": 3_000_000}}, {}, ("3 MB are free on /home/pi: records of a run",)),
+        (
+            {"disk": {"free_bytes": 3_000_000}},
+            {},
+            ("3.0 MB are free on /home/pi: records of a run",),
+        ),
         ({}, {"cosmos_realtime_priority": 50}, ("is granted real-time priority 0, not 50",)),
         ({"uses_pam": False}, {"cosmos_realtime_priority": 50}, ("set `UsePAM yes` in",)),
         ({"uses_pam": True}, {"cosmos_realtime_priority": 50}, ("perhaps pam_limits is missing",)),

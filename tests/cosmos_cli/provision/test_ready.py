@@ -16,6 +16,8 @@ from cosmos_cli.provision.before_run import Cargo, cargo_of, make_ready
 from cosmos_cli.provision.environment import install_environment
 from cosmos_cli.provision.platform import greeted_platform
 from cosmos_cli.provision.wheelhouse import prepare
+from cosmos_cli.ui import invocation
+from cosmos_cli.ui.invocation import Invocation
 
 pytestmark = pytest.mark.process
 
@@ -94,6 +96,20 @@ def test_missing_environment_names_the_command_that_makes_it(machine, index, sce
     assert caught.value.kind is FailureKind.STEP
     assert f"cosmos up -i INVENTORY {scenario.path}" in caught.value.advice
     assert not Path(machine.layout.trees).exists()
+
+
+def test_command_that_makes_it_is_told_with_the_inventory_that_was_given(
+    machine, index, scenario, monkeypatch
+):
+    words = ("-qi", "my box.yaml", "--limit=pi01", str(scenario.path))
+    given = Invocation(verb="run", words=words, valued=frozenset({"-i", "--limit"}))
+    monkeypatch.setattr(invocation, "current", lambda: given)
+
+    with pytest.raises(MachineFailure) as caught:
+        ready(machine, scenario)
+
+    up = f"cosmos up -i 'my box.yaml' --limit pi01 {scenario.path}"
+    assert f"run `{up}` first" in caught.value.advice
 
 
 def test_environment_without_the_scenarios_requirements_is_not_enough(machine, index, scenario):

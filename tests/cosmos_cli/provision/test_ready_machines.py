@@ -43,4 +43,4 @@ def test_full_disk_is_noted_though_nothing_is_to_be_done(again):
     found = again(free_bytes=3_000_000)
 
     assert (found.failure, found.changed_count) == (None, 0)
-    assert [note for note in found.notes if "3 MB are free" in note]
+    assert [note for note in found.notes if "3.0 MB are free" in note]

@@ -197,7 +197,10 @@ def test_ctrl_c_ends_all_runs_cleanly_and_tells_what_was_found(cosmos, monkeypat
         (("--seeds", ""), "--seeds: expected numbers or ranges such as 1..20, got ''"),
         (("none.yaml",), "none.yaml: no such file or folder"),
         (("--set", "agents.count=0"), "agents.count: expected >= 1"),
+        (("--set", "test.deadline_s=1"), "--set test.deadline_s: changes nothing"),
+        (("--set", "test={tags: [x]}"), "--set test: changes nothing"),
         (("--update-baselines", "--seeds", "1"), "leave out --seeds"),
+        (("--update-baselines", "--realtime-max", "1"), "and --realtime-max"),
         (("empty",), "no tests: no scenarios there"),
     ],
 )
