@@ -60,7 +60,9 @@ def labels_fault(agents: tuple[str, ...], found: Any) -> str | None:
         if label in known and label != agent:
             return f"calls {agent} {label}, which is another agent's name: nobody could tell them apart"
         if label in NO_LABELS:
-            return f"calls {agent} {label}, which means {NO_LABELS[label]} wherever an agent is named"
+            return (
+                f"calls {agent} {label}, which means {NO_LABELS[label]} wherever an agent is named"
+            )
     return None
 
 
