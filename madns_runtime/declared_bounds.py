@@ -8,9 +8,11 @@ from dataclasses import is_dataclass
 from itertools import repeat
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from annotated_types import Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen
+from annotated_types import Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen, MultipleOf, Predicate
 
 UNIONS = (Union, types.UnionType)
+ROUNDING = 1e-9
+"""Of a number, by which it may miss a multiple, as where scenarios are read."""
 
 
 def bound_faults(value: Any, path: str) -> list[str]:
@@ -88,4 +90,19 @@ def _beyond(bound: Any, value: Any) -> str | None:
         return None if value <= bound.le else f"at most {bound.le}"
     if isinstance(bound, Lt):
         return None if value < bound.lt else f"less than {bound.lt}"
+    if isinstance(bound, MultipleOf):
+        return (
+            None if _is_multiple(value, bound.multiple_of) else f"a multiple of {bound.multiple_of}"
+        )
+    if isinstance(bound, Predicate):
+        name = getattr(bound.func, "__qualname__", "its predicate")
+        return None if bound.func(value) else f"a value for which {name} holds"
     return None
+
+
+def _is_multiple(value: Any, of: Any) -> bool:
+    """Tell whether a number is a multiple of another; but for rounding, where either is no whole one."""
+    rest = abs(value % of)
+    if isinstance(value, int) and isinstance(of, int):
+        return bool(rest == 0)
+    return bool(min(rest, abs(of) - rest) <= ROUNDING * abs(value))

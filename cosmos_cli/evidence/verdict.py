@@ -8,6 +8,7 @@ holds: what could not be measured counts as not held.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeGuard
@@ -24,6 +25,9 @@ UNJUDGED_IN_LOCKSTEP = (
 )
 TICKS_OF_A_RATE = 2
 """A real-time factor needs so many ticks at least."""
+OF_SUMMARIES = "summary."
+"""Begins the names of checks that the framework adds to the summary of either half."""
+SAME_NAMES_TOLD = 5
 WAKE_UP_LATE_S = 0.02
 """A single wake-up may be late by this much on an idle machine; lateness has checks of its own."""
 
@@ -180,7 +184,7 @@ def judge(facts: RunFacts, limits: CheckLimits) -> Verdict:
         who=who,
         reason=reason,
         checks=tuple(checks),
-        remarks=(*_unjudged(facts), *facts.remarks),
+        remarks=(*_unjudged(facts), *_same_names(facts, checks), *facts.remarks),
     )
 
 
@@ -188,6 +192,19 @@ def _unjudged(facts: RunFacts) -> tuple[str, ...]:
     if facts.is_lockstep:
         return (UNJUDGED_IN_LOCKSTEP,)
     return () if _is_rate_judged(facts) else (f"time.rtf: not judged: {facts.no_rate}",)
+
+
+def _same_names(facts: RunFacts, checks: Sequence[CheckResult]) -> tuple[str, ...]:
+    """Return a remark if a half's check has a name that another check has, too: whoever asks by the name finds both."""
+    counts = Counter(check.name for check in checks)
+    own = dict.fromkeys(check.name for check in facts.plugin_checks)
+    names = [name for name in own if counts[name] > 1 and not name.startswith(OF_SUMMARIES)]
+    if not names:
+        return ()
+    return (
+        f"checks: more than one is called {first_few(names, SAME_NAMES_TOLD)}: nobody can tell them apart by it; those"
+        " that finish() returns need names that no expectation, no check of the framework and not the other half has",
+    )
 
 
 def _is_rate_judged(facts: RunFacts) -> bool:

@@ -26,10 +26,12 @@ class AgentLabels:
 
     def like(self, pattern: str, agents: Sequence[str]) -> list[str]:
         """Return those of *agents* whose name or label is *pattern*, or fits it as a glob; case counts."""
-        if not any(character in pattern for character in "*?["):
-            return [agent for agent in agents if pattern in (agent, self.names.get(agent))]
-        fits = re.compile(fnmatch.translate(pattern)).match
-        return [agent for agent in agents if fits(agent) or fits(self.names.get(agent, agent))]
+        called = {agent for agent in agents if pattern in (agent, self.names.get(agent))}
+        if any(character in pattern for character in "*?["):  # a label may hold them: IRIDIUM 8 [-]
+            fits = re.compile(fnmatch.translate(pattern)).match
+            both = ((agent, self.names.get(agent, agent)) for agent in agents)
+            called |= {agent for agent, label in both if fits(agent) or fits(label)}
+        return [agent for agent in agents if agent in called]
 
     def labelled(self, patterns: Iterable[str]) -> list[str]:
         """Return the agents whose label is, or fits as a glob, one of *patterns*."""

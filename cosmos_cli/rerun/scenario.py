@@ -22,11 +22,11 @@ from cosmos_cli.rerun.recorded_run import FlownRun, UsedDevice
 from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
-from madns_runtime.errors import MadnsError
+from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.kinds.playback import streams_of
 from madns_runtime.plugin.queries import ask_rerun
-from madns_runtime.plugin.registry import is_shipped, parse_parameters, resolve
+from madns_runtime.plugin.registry import is_file, is_shipped, parse_parameters, resolve
 from madns_runtime.recording.reader import read_stream
 
 PLAYBACK: Final = "playback"
@@ -62,7 +62,9 @@ def make_rerun(recorded: FlownRun) -> RerunScenario:
     try:
         told = _ask_simulation(config, recorded.run.path)
     except (MadnsError, SeparateFailure, SeparateDefect) as error:
-        raise InputError(f"{recorded.run.name} cannot be flown again: {error}") from error
+        raise InputError(
+            f"{recorded.run.name} cannot be flown again: {error}{_cure(recorded)}"
+        ) from error
     remarks = list(told["remarks"])
     remarks += [
         f"{name}: {counted(agent.missed, 'tick')} missed; lockstep misses none"
@@ -83,6 +85,15 @@ def make_rerun(recorded: FlownRun) -> RerunScenario:
         },
         unlike=() if config.time.is_lockstep else tuple(told["unlike"]),
     )
+
+
+def _cure(recorded: FlownRun) -> str:
+    """Return what to do where today's file of a simulation does not answer; nothing where another flies, or it is no file."""
+    today = recorded.run.read_config()
+    folder, simulation = recorded.config.base_directory, recorded.config.simulation
+    if today is None or today.base_directory != folder or not is_file(simulation):
+        return ""
+    return f"; where {simulation} is gone, or was changed since, fly the run's own copy with --as-recorded"
 
 
 def _checked(recorded: FlownRun, values: Mapping[str, Any], carried: CarriedOver) -> ScenarioFile:
@@ -148,7 +159,7 @@ def _ask_simulation(config: RunConfig, run: Path) -> Mapping[str, Any]:
 
     answer = work_separately(guarded, limit_s=config.timeouts.loading_s)
     if "fault" in answer:
-        raise InputError(str(answer["fault"]))
+        raise PluginError(str(answer["fault"]))
     return answer
 
 

@@ -44,10 +44,27 @@ def to_plain(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Mapping):
-        return {KIND: "mapping", "items": {str(key): to_plain(item) for key, item in value.items()}}
+        return {KIND: "mapping", "items": _items(value)}
     if isinstance(value, list | tuple):
         return [to_plain(item) for item in value]
     raise TypeError(f"figures hold numbers, texts and values of theirs, got {type(value).__name__}")
+
+
+def _items(mapping: Mapping[Any, Any]) -> dict[str, Any]:
+    """
+    Return a mapping's items by texts, as JSON has them.
+
+    Raises:
+        TypeError: Two keys have one text, so that one of them would be lost.
+    """
+    items: dict[str, Any] = {}
+    for key, item in mapping.items():
+        if str(key) in items:
+            raise TypeError(
+                f"a mapping's keys are texts in JSON, and two of one are {str(key)!r:.80}: give them other names"
+            )
+        items[str(key)] = to_plain(item)
+    return items
 
 
 def from_plain(plain: Any) -> Any:

@@ -161,10 +161,11 @@ class LinkMedium:
             if receiver == sender:
                 continue
             barrier: Any = self._reach(sender, receiver, leaves_s) if self._reach else None
-            if barrier is not None and (not isinstance(barrier, str) or not barrier):
+            if barrier is not None and not _is_reason(barrier):
                 raise PluginError(
                     f"reach({sender!r}, {receiver!r}, {leaves_s:g}) returned {shown(barrier)}: expected None if the"
-                    " receiver can receive it, else why not, in a word such as 'out_of_range'"
+                    " receiver can receive it, else why not, in a word such as 'out_of_range' other than"
+                    f" {DELIVERED!r} and {LOST!r}"
                 )
             if barrier and to == EVERYBODY:
                 continue
@@ -236,6 +237,11 @@ def _shown_answer(value: Any) -> str:
     """Return an answer for a message; of a function its name and what it takes."""
     name = getattr(value, "__qualname__", None)
     return f"{name}{inspect.signature(value)}" if name and callable(value) else shown(value)
+
+
+def _is_reason(value: Any) -> bool:
+    """Tell whether a value says why a message is refused; that it is lost, or delivered, says the medium itself."""
+    return isinstance(value, str) and value not in ("", DELIVERED, LOST)
 
 
 def _is_positive(value: Any) -> bool:

@@ -31,6 +31,8 @@ UNSAID = ("within_s",)
 """Figures that may be None."""
 ENDLESS = ("buffer_s", "lead_s")
 """Figures that may be infinite: of who needs nothing, and of who commands nothing."""
+NO_LABELS = {"host": "the host", "*": "all agents"}
+"""Texts that are no second name of an agent, and what they mean."""
 FIGURE_MAX = 1e18
 """Of bytes, seconds and hertz; what is beyond is a slip, and its products with agents and rates need no infinity."""
 
@@ -57,6 +59,10 @@ def labels_fault(agents: tuple[str, ...], found: Any) -> str | None:
             )
         if label in known and label != agent:
             return f"calls {agent} {label}, which is another agent's name: nobody could tell them apart"
+        if label in NO_LABELS:
+            return (
+                f"calls {agent} {label}, which means {NO_LABELS[label]} wherever an agent is named"
+            )
     return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
 from importlib import metadata
@@ -40,12 +41,26 @@ def place_of_name(group: str, name: str) -> str:
 
 
 def distributions_of(group: str, name: str) -> dict[str, str]:
-    """Return the versions of the distributions that register a name; nothing of one that is not registered."""
-    return {
-        entry.dist.name: entry.dist.version
+    """
+    Return the versions of the distributions that register a name; nothing of one that is not registered.
+
+    Of a place such as package.module:NAME they are those that register another in the package, or the one of the package's
+    name: to look through all distributions for the one that has its file takes a second.
+    """
+    package, colon, _ = name.partition(":")
+    top = package.partition(".")[0]
+    entries = [
+        entry
         for entry in _entries(group, tuple(sys.path))
-        if entry.name == name and entry.dist is not None
-    }
+        if entry.name == name or (colon and entry.module.partition(".")[0] == top)
+    ]
+    found = {entry.dist.name: entry.dist.version for entry in entries if entry.dist is not None}
+    if not found and colon and top.isidentifier():
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            of_name = metadata.distribution(top)
+            if top in (of_name.read_text("top_level.txt") or top).split():
+                found[of_name.name] = of_name.version
+    return found
 
 
 @functools.lru_cache(maxsize=16)

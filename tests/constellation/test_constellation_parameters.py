@@ -85,6 +85,18 @@ def test_what_is_out_of_bounds_is_refused_where_it_is_read(mapping):
         adapter_of(ConstellationParameters).validate_python(mapping)
 
 
+@pytest.mark.parametrize("given", [[1, 2**53 + 1], [1, 0.5], [2.0], ["a"], []])
+def test_lists_of_settings_reach_flight_software_as_written(given):
+    mapping = {**VALID["walker"], "flight": {"software": "a.py:A", "settings": {"ids": given}}}
+
+    read = adapter_of(ConstellationParameters).validate_python(mapping)
+    flown = from_mapping(ConstellationParameters, to_mapping(read))
+
+    assert read.flight.settings["ids"] == flown.flight.settings["ids"] == given
+    kind = type(given[-1]) if given else None
+    assert [type(item) for item in flown.flight.settings["ids"]] == [kind] * len(given)
+
+
 def orbit(**values):
     return {"keplerian": [{"name": "A", "a_km": 7000.0} | values]}
 

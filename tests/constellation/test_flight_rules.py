@@ -15,7 +15,10 @@ from cosmos_cli.models.inventory.machine import Machine, Variables
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.models.place_uses import shared_places
 from madns_runtime.simulations.constellation.check import find_faults, place_uses
-from madns_runtime.simulations.constellation.check_flight import SETTING_BYTES_MAX
+from madns_runtime.simulations.constellation.check_flight import (
+    SETTING_BYTES_MAX,
+    _setting_faults,
+)
 from madns_runtime.simulations.constellation.flight.interface import content
 from madns_runtime.simulations.constellation.flight.interface.json_lines import JsonLines
 from madns_runtime.simulations.constellation.substitution import substitute, unknown_names
@@ -313,6 +316,19 @@ def test_settings_are_held_to_the_fields_of_their_struct():
     assert {name: f"{most}s" for name, most in SETTING_BYTES_MAX.items()} == {
         name: codes[name] for name in SETTING_BYTES_MAX
     }
+    assert codes["value"] == "d"
+
+
+def test_a_whole_number_that_its_struct_would_round_is_a_fault():
+    given = {"id": 2**53 + 1, "ids": [1, -(2**63) + 1], "exact": 2**60, "share": 0.1}
+
+    faults = list(_setting_faults("flight.settings", given))
+
+    assert [fault.partition(":")[0] for fault in faults] == [
+        "flight.settings.id",
+        "flight.settings.ids",
+    ]
+    assert "float holds, got 9007199254740993: write it as a text" in faults[0]
 
 
 @pytest.mark.parametrize(

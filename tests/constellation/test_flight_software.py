@@ -424,6 +424,7 @@ def body(*lines):
         ("self.context.estimate({'a': 1}); self.context.estimate({'b': 1})", "numbers for a,"),
         ("self.context.estimate({'a': 'x'})", "numbers for a,"),
         ("self.context.estimate({1: 2.0})", "names such as slot_error_deg, got 1"),
+        ("self.context.estimate({'tick': 2.0})", "estimate: tick is taken, as each record bears"),
         ("self.context.estimate({chr(0xD800): 2.0})", "names such as slot_error_deg, got "),
         ("import numpy; self.context.delta_v(numpy.array(1.0), at_s=1.0)", "three numbers in m/s"),
     ],

@@ -349,6 +349,14 @@ def test_reach_says_who_receives_and_why_not():
     assert (nobody.to, nobody.outcome) == ("*", "nobody_in_reach")
 
 
+@pytest.mark.parametrize("word", ["lost", "delivered", ""])
+def test_a_reach_refuses_for_a_reason_and_does_not_say_what_became_of_a_message(word):
+    air = medium(reach=lambda *way: word)
+
+    with pytest.raises(PluginError, match=r"^reach\('car-1', .* expected None .*, else why not"):
+        carried(air, "car-3")
+
+
 @pytest.mark.parametrize("to", ["car-1", "car-9", "kiosk"])
 def test_oneself_and_the_unknown_are_refused(to):
     assert carried(medium(), to)[0].outcome == "unknown_receiver"

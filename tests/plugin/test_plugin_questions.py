@@ -350,6 +350,8 @@ def streams(parameters, agents):
         (r"'x\n'", "must call a by a text of at most 200 printable characters"),
         ("'x' * 201", "must call a by a text of at most 200 printable characters"),
         ("'b'", "calls a b, which is another agent's name"),
+        ("'host'", "calls a host, which means the host wherever an agent is named"),
+        ("'*'", "calls a *, which means all agents wherever an agent is named"),
     ],
 )
 def test_labels_that_no_file_holds_or_that_are_names_of_others_are_told(plugin, label, told):

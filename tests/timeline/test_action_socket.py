@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import orjson
 import pytest
-from annotated_types import Gt, Interval, Len, Lt
+from annotated_types import Gt, Interval, Len, Lt, MultipleOf, Predicate
 
 from madns_runtime.hardware.action_socket import (
     AGENTS_TOLD_MAX,
@@ -194,6 +194,9 @@ class Bounded:
     pair: tuple[Positive, float] = (1.0, -1.0)
     parts_m: Mapping[str, Positive] | None = None
     either: Positive | str = "none"
+    step_m: Annotated[float, MultipleOf(0.1)] = 0.3
+    teeth: Annotated[int, MultipleOf(4)] = 8
+    word: Annotated[str, Predicate(str.islower)] = "a"
     drive: Wheel | Sail = Wheel()
 
 
@@ -209,6 +212,10 @@ class Bounded:
         ({"parts_m": {"left": 0}}, "parts_m.left: expected more than 0, got 0.0"),
         ({"either": 0}, "either: expected more than 0, got 0.0"),
         ({"either": "all"}, ""),
+        ({"step_m": -0.7}, ""),
+        ({"step_m": 0.75}, "step_m: expected a multiple of 0.1, got 0.75"),
+        ({"teeth": 6}, "teeth: expected a multiple of 4, got 6"),
+        ({"word": "Up"}, "word: expected a value for which str.islower holds, got 'Up'"),
         ({"drive": {"angle_deg": 100}}, "drive.angle_deg: expected less than 90, got 100.0"),
     ],
 )

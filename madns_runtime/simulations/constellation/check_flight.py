@@ -181,3 +181,8 @@ def _setting_faults(field: str, settings: Mapping[str, Setting]) -> Iterator[str
         for value in given if isinstance(given, list) else [given]:
             if isinstance(value, str) and len(value.encode()) > most:
                 yield f"{field}.{name}: expected a text of at most {most} bytes for this protocol, got {value!r:.80}"
+            if isinstance(value, int) and int(float(value)) != value:
+                yield (
+                    f"{field}.{name}: expected a number that this protocol's 64-bit float holds, got {value}: write it as"
+                    " a text in quotes"
+                )

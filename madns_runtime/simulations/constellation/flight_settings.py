@@ -13,7 +13,7 @@ from annotated_types import Gt, Le, MinLen
 
 from madns_runtime.simulations.constellation.interface_settings import FlightInterface
 
-Setting = bool | int | float | str | list[float] | list[str]
+Setting = bool | int | float | str | list[int] | list[float] | list[str]
 """A value of one's own that a scenario hands to code of one's own."""
 
 

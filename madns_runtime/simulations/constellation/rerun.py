@@ -20,6 +20,7 @@ from madns_runtime.simulations.constellation.flight_settings import (
     FlightClass,
     FlightProcess,
     FlightRule,
+    Setting,
 )
 from madns_runtime.simulations.constellation.interface_settings import DeviceTransport
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
@@ -100,7 +101,5 @@ def _played(rule: FlightRule, number: int, run: Path, remarks: list[str]) -> Fli
         f"{which}: cannot be stepped, as {why}: its recorded commands and estimates are given again, but no messages, "
         "whose content is not on record"
     )
-    settings: dict[str, bool | int | float | str | list[float] | list[str]] = {
-        "agents": str(run / "agents")
-    }
+    settings: dict[str, Setting] = {"agents": str(run / "agents")}
     return FlightClass(software=PLAYER, agents=rule.agents, rate_hz=rule.rate_hz, settings=settings)

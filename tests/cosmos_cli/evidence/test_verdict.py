@@ -297,6 +297,21 @@ def test_what_is_wrong_with_a_malformed_check_is_a_remark_with_who_returned_it()
     )
 
 
+def test_a_halfs_check_with_the_name_of_another_is_a_remark():
+    def check(name):
+        return CheckResult(name=name, limit=1, got=0, passed=True)
+
+    twice = judged(
+        plugin_checks=(check("agents.lost"), check("gap_m"), check("own_m")),
+        expectations=(check("gap_m"),),
+    )
+    once = judged(plugin_checks=(check("own_m"),), expectations=(check("gap_m"),))
+
+    (remark,) = twice.remarks
+    assert "more than one is called agents.lost, gap_m: " in remark
+    assert once.remarks == ()
+
+
 @pytest.mark.parametrize("summary", [{}, {"checks": []}, {"checks": ()}])
 def test_summary_without_checks_has_none(summary):
     assert plugin_checks({"host": summary}) == []

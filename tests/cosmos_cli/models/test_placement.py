@@ -125,6 +125,15 @@ def test_rules_find_agents_by_their_second_names():
     assert fault[1] == "no agent is named IRIDIUM 77, did you mean IRIDIUM 7?"
 
 
+def test_a_second_name_with_brackets_is_found_by_itself_and_as_a_glob():
+    names = {"a": "IRIDIUM 7 [-]", "b": "IRIDIUM 8 [-]", "c": "IRIDIUM 8 -"}
+    labels = AgentLabels(column="satellite", names=names)
+
+    assert labels.like("IRIDIUM 7 [-]", ["a", "b", "c"]) == ["a"]
+    assert labels.like("IRIDIUM 8 [-]", ["a", "b", "c"]) == ["b", "c"]
+    assert labels.labelled(["IRIDIUM 7 [-]"]) == ["a"]
+
+
 CONSTELLATION = """
 name: a
 simulation: constellation

@@ -427,3 +427,10 @@ def test_a_scene_has_the_proportions_of_all_that_is_drawn_in_it(drawn, sides):
         scene = to_plotly(SpaceFigure(title="t", unit="m", **drawn)).layout["scene"]
 
     assert scene["aspectratio"] == pytest.approx(dict(zip("xyz", sides, strict=True)))
+
+
+def test_keys_of_a_document_that_would_become_one_text_are_refused():
+    assert from_plain(to_plain({1: 2, "a": {2.5: [1]}})) == {"1": 2, "a": {"2.5": [1]}}
+
+    with pytest.raises(TypeError, match="keys are texts in JSON, and two of one are '1'"):
+        to_plain({"far": {1: 2, "1": 3}})

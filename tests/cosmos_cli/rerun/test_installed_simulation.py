@@ -8,6 +8,8 @@ import pytest
 
 from cosmos_cli import app
 from cosmos_cli.rerun.flown_software import installed_remarks
+from madns_runtime.plugin.entry_points import distributions_of
+from madns_runtime.plugin.registry import GROUP
 
 MODULE = """
 from dataclasses import dataclass
@@ -88,3 +90,22 @@ def test_what_a_distribution_installs_is_flown_as_it_is_today_and_told(
 def test_shipped_simulations_and_files_of_the_scenarios_folder_are_no_packages_of_others():
     assert installed_remarks("constellation") == ()
     assert installed_remarks("./rover.py:simulation") == ()
+
+
+@pytest.mark.parametrize("is_registered", [True, False])
+def test_the_version_of_a_simulation_that_is_named_by_its_place_is_on_record(
+    tmp_path, monkeypatch, is_registered
+):
+    install(tmp_path, "1.0")
+    info = tmp_path / "kites-1.0.dist-info"
+    if not is_registered:
+        (info / "entry_points.txt").unlink()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: kites_sim\nVersion: 1.0\n")
+        info.rename(tmp_path / "kites_sim-1.0.dist-info")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    name = "kites" if is_registered else "kites_sim"
+
+    assert distributions_of(GROUP, "kites_sim:simulation") == {name: "1.0"}
+    assert distributions_of(GROUP, "kites_sim.part:other") == {name: "1.0"}
+    assert distributions_of(GROUP, "./kites_sim.py:simulation") == {}
+    assert distributions_of(GROUP, "no_such_module:simulation") == {}

@@ -46,6 +46,8 @@ MISTAKES = {
     "unknown_receiver": "there is no other vehicle and no station of that name",
 }
 """Refusals that no waiting cures: the first of each is told in the log."""
+TAKEN = frozenset(field.name for field in streams.ESTIMATES)
+"""Names of the fields that every record of estimates has."""
 ESTIMATES_MAX = 64
 """Names in an estimate."""
 LOG_CHARACTERS_MAX = 2000
@@ -240,6 +242,10 @@ class VehicleContext:
             if not isinstance(name, str) or not name.isprintable() or not name:
                 raise PluginError(
                     f"estimate: expected names such as slot_error_deg, got {name!r:.80}"
+                )
+            if name in TAKEN:
+                raise PluginError(
+                    f"estimate: {name} is taken, as each record bears it already; choose another name"
                 )
         fields = [Field(name, streams.unit_of(name)) for name in names]
         self._context.open_stream("estimates", (*streams.ESTIMATES, *fields))
