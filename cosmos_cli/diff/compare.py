@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
@@ -20,6 +20,7 @@ from cosmos_cli.evidence.simulation_calls import call_simulation, check_blocks, 
 from cosmos_cli.evidence.streams import file_size_bytes
 from cosmos_cli.evidence.tables import no_tables, open_recorded_run
 from cosmos_cli.evidence.verdict import is_number
+from cosmos_cli.models.expectation import owner_of
 from madns_runtime.analysis.tables import ComparedRun
 from madns_runtime.analysis.values import SimulationDifference
 from madns_runtime.errors import PluginError
@@ -75,9 +76,11 @@ class Selection:
     streams: tuple[str, ...] = ()
     """Globs of streams or tables; empty for all that the simulation records."""
 
-    def takes(self, recorded: Recorded) -> bool:
-        """Tell whether a stream is compared."""
-        if recorded.role == "agent" and self.agents and not _fits(recorded.source, self.agents):
+    def takes(self, recorded: Recorded, agents: Collection[str]) -> bool:
+        """Tell whether a stream is compared; *agents* are all of the runs, who have their own devices' records, too."""
+        owner = owner_of(recorded.source) if recorded.role == "device" else recorded.source
+        is_of_agent = recorded.role == "agent" or (recorded.role == "device" and owner in agents)
+        if is_of_agent and self.agents and not _fits(owner, self.agents):
             return False
         if self.streams:
             return any(_fits(name, self.streams) for name in (recorded.stream, recorded.table))
@@ -154,8 +157,9 @@ def compare(
         MachineError: A file of theirs cannot be read.
     """
     check_comparable(a, b)
-    of_a = {key: one for key, one in a.streams.items() if selection.takes(one)}
-    of_b = {key: one for key, one in b.streams.items() if selection.takes(one)}
+    agents = {*a.agents, *b.agents}
+    of_a = {key: one for key, one in a.streams.items() if selection.takes(one, agents)}
+    of_b = {key: one for key, one in b.streams.items() if selection.takes(one, agents)}
     result = Comparison(
         a=a,
         b=b,

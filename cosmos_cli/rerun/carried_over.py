@@ -2,7 +2,8 @@
 Checks and timeline of a recorded run's scenario, as a rerun in lockstep can have them.
 
 Taken from scenario.yaml in the run's directory. What does not fit is named: faults of devices are in the samples that are
-played back, and a run in real time that ended early ends again with the tick that was its last.
+played back, and a run in real time that ended early ends again with the tick that was its last, one in lockstep that was
+interrupted where it was.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ def carried_over(recorded: FlownRun) -> CarriedOver:
     found.timeline = _items(document.value, "timeline")
     found.checks = _items(document.value, "checks")
     _replace_device_faults(found, is_lockstep=recorded.config.time.is_lockstep)
-    if not recorded.config.time.is_lockstep:
+    if not recorded.config.time.is_lockstep or recorded.cut_s is not None:
         _end_as_recorded(found, recorded)
     return found
 
@@ -154,15 +155,24 @@ def _without_condition(entry: Item) -> Item:
 
 
 def _end_as_recorded(found: CarriedOver, recorded: FlownRun) -> None:
-    """Have a rerun end with the last tick on record, whatever ended the run."""
+    """Have a rerun end with the last tick on record, or where one in lockstep was cut off, whatever ended the run."""
     for number, entry in found.timeline.items():
         if entry.get("action") == STOP.word:
             found.timeline[number] = _stand_in(entry)
     for check in found.checks.values():
         if check.get("stop_when_broken"):
             check["stop_when_broken"] = False
-    last_s = max(agent.last_s for agent in recorded.agents.values())
     period_s = 1.0 / recorded.config.agents.tick_hz
+    if recorded.cut_s is not None:  # agents may have taken the step that was under way
+        end_s = recorded.cut_s + 0.5 * period_s
+        if end_s < recorded.config.time.duration_s:
+            found.ends = ({"at_s": end_s, "action": STOP.word},)
+        found.remarks.append(
+            f"it was cut off at {recorded.cut_s:g} s: the rerun ends there, too, and what it alone has of the last ticks"
+            " is not compared"
+        )
+        return
+    last_s = max(agent.last_s for agent in recorded.agents.values())
     end_s = last_s + 0.5 * period_s
     if last_s + 1.5 * period_s < recorded.config.time.duration_s:
         found.ends = ({"at_s": end_s, "action": STOP.word},)

@@ -109,23 +109,22 @@ def _compare(  # noqa: PLR0913 - both sides of one channel
     if channel.direction == "in":
         kept = [row for row in a if None not in row[len(HEAD) :]]
         seen = [row for row in kept if row[0] + row[2] * 1e-6 <= agent.last_wake_s + SAME_TIME_S]
-        if agent.ticks is None:
-            seen, b = (
-                [row for row in rows if row[0] <= agent.last_s + SAME_TIME_S] for rows in (kept, b)
-            )
+        if agent.ticks is None:  # a fault behind the last tick has lockstep's devices go on to it
+            b = [row for row in b if row[0] + row[2] * 1e-6 <= agent.last_s + SAME_TIME_S]
         pairs: list[Pair] = _in_order(seen, b)
         is_same, left_out = _is_same_input, len(kept) - len(seen)
     else:
         # Before time zero only lockstep records what is put out.
         a, b = ([row for row in rows if row[0] >= 0.0] for rows in (a, b))
-        refused_s, safe_s = _told_times(used.folder, channel)
+        refused_s, safe_s, fault_s = _told_times(used.folder, channel)
         in_time = sum(row[0] <= agent.last_s for row in a)
         kept_b = _without_refused(a[:in_time], b, refused_s) if channel.is_frame else b
         pairs = _in_order(a, kept_b) if channel.is_frame else _by_time(a, b)
         explained = _leave_out_explained(pairs, refused_s, safe_s) + len(b) - len(kept_b)
         # What was put out after the last step of lockstep has no partner, at the end.
         whole = len(pairs)
-        while pairs and pairs[-1][1] is None and (pairs[-1][0] or (0.0,))[0] > agent.last_s:
+        has_gone_on = agent.ticks is None and max(fault_s, default=0.0) > agent.last_s
+        while pairs and _is_of_end(pairs[-1], agent.last_s, has_gone_on=has_gone_on):
             pairs.pop()
         is_same, left_out = _is_same_output, whole - len(pairs) + explained
     if is_early:
@@ -144,10 +143,24 @@ def _compare(  # noqa: PLR0913 - both sides of one channel
     )
 
 
-def _told_times(folder: Path, channel: Channel) -> tuple[list[float], list[float]]:
-    """Return when a device's events tell that values for an output were refused, and that its profile had run out, s."""
+def _is_of_end(pair: Pair, last_s: float, *, has_gone_on: bool) -> bool:
+    """
+    Tell whether a value on record alone was put out after the last step of lockstep.
+
+    Where a fault behind that step had the device go on, what the step itself wrote was put out, too.
+    """
+    row, of_rerun = pair
+    if row is None or of_rerun is not None:
+        return False
+    if has_gone_on:
+        return bool(row[0] + row[1] * 1e-6 > last_s - SAME_TIME_S)
+    return bool(row[0] > last_s)
+
+
+def _told_times(folder: Path, channel: Channel) -> tuple[list[float], list[float], list[float]]:
+    """Return when a device's events tell that an output refused values, that its profile had run out, and of faults, s."""
     refused = re.compile(rf"(?:[^\s:]+: )?{re.escape(channel.name)}: ")
-    times: tuple[list[float], list[float]] = ([], [])
+    times: tuple[list[float], list[float], list[float]] = ([], [], [])
     for event in _rows(folder / f"{EVENTS.name}.jsonl"):
         told: Mapping[str, Any] = event if isinstance(event, Mapping) else {}
         t_s = told.get("t_s")
@@ -157,6 +170,8 @@ def _told_times(folder: Path, channel: Channel) -> tuple[list[float], list[float
             times[0].append(t_s)
         elif told.get("event") == "underrun" and told.get("channel") == channel.name:
             times[1].append(t_s)
+        elif told.get("event") == "fault":
+            times[2].append(t_s)
     return times
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,9 @@ from cosmos_cli.evidence.devices import expected_devices
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import file_size_bytes
 from cosmos_cli.evidence.table_labels import run_labels
+from cosmos_cli.evidence.tables import open_tables
 from cosmos_cli.ui.foreign_text import clean_line
+from madns_runtime.analysis.tables import RecordedRun
 from madns_runtime.config import RunConfig
 from madns_runtime.errors import MadnsError
 from madns_runtime.hardware.kinds.playback import streams_of
@@ -73,6 +76,8 @@ class FlownRun:
     devices: tuple[UsedDevice, ...]
     is_cut_off: bool = False
     """Whether it was in real time and did not complete: its agents need not have ended with the same tick."""
+    cut_s: float | None = None
+    """Simulated time at which one in lockstep was interrupted, or its host killed, s; None of any other."""
     killed: frozenset[str] = frozenset()
     """Agents of a run in real time that a fault ended for good: what they had not written yet is on no record."""
 
@@ -112,10 +117,14 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None) -
     names = config.agents.resolved_names()
     faults: list[str] = []
     agents = {}
-    killed = _killed(run, config)
+    killed, cut_s = _killed(run, config), _cut_s(run, config)
     for name in names:
         try:
-            agents[name] = _read_agent(run.path / "agents" / name, config, is_killed=name in killed)
+            agents[name] = (
+                _in_lockstep(config, cut_s)
+                if config.time.is_lockstep
+                else _read_agent(run.path / "agents" / name, config, is_killed=name in killed)
+            )
         except InputError as error:
             faults.append(str(error))
     if not faults and all(agent.last_s < 0.0 for agent in agents.values()):
@@ -132,6 +141,7 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None) -
         agents=agents,
         devices=devices,
         is_cut_off=is_cut_off,
+        cut_s=cut_s,
         killed=killed,
     )
 
@@ -151,17 +161,38 @@ def scenario_folder(run: RunDirectory) -> Path | None:
     return folder if folder is not None and os.path.isdir(folder) else None
 
 
+def _cut_s(run: RunDirectory, config: RunConfig) -> float | None:
+    """Return when a run in lockstep was cut off, simulated, s; None if nothing from outside ended it."""
+    if not config.time.is_lockstep:
+        return None
+    document = run.read_json(run.run_json) or {}
+    status = document.get("status")
+    if status != "interrupted":
+        has_no_result = run.read_json(run.result_json) is None
+        is_of_operator = document.get("who") == "operator"  # whose terminal was closed, say
+        if status not in ("failed", "aborted") or not (has_no_result or is_of_operator):
+            return None
+    tables = open_tables(run.tables)
+    return RecordedRun(document=document, tables=tables, config=config).end_s
+
+
+def _in_lockstep(config: RunConfig, cut_s: float | None) -> RecordedAgent:
+    """Return an agent whose ticks were on time; of a run that was cut off up to the last that was surely whole, and answered."""
+    tick_hz = config.agents.tick_hz
+    ticks = count_ticks(config.time.duration_s, tick_hz)
+    if cut_s is not None:
+        ticks = max(min(ticks, math.floor(cut_s * tick_hz) - 1), 1)
+    last_s = (ticks - 1) / tick_hz
+    return RecordedAgent(ticks=None, last_s=last_s, last_wake_s=last_s)
+
+
 def _read_agent(folder: Path, config: RunConfig, *, is_killed: bool) -> RecordedAgent:
     """
-    Read an agent's ticks; one that a fault killed may have written none.
+    Read an agent's ticks in real time; one that a fault killed may have written none.
 
     Raises:
         InputError: They are not there, or the agent was started anew.
     """
-    if config.time.is_lockstep:
-        tick_hz = config.agents.tick_hz
-        last_s = (count_ticks(config.time.duration_s, tick_hz) - 1) / tick_hz
-        return RecordedAgent(ticks=None, last_s=last_s, last_wake_s=last_s)
     name, ticks = folder.name, folder / "ticks.jsonl"
     if any(folder.glob("ticks.[0-9]*.jsonl")):
         raise InputError(

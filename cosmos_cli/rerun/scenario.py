@@ -17,7 +17,7 @@ from cosmos_cli.models.scenario import Scenario
 from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
 from cosmos_cli.models.yaml_source import yaml_text
 from cosmos_cli.rerun.carried_over import ATTEMPTS_MAX, CarriedOver, carried_over
-from cosmos_cli.rerun.early_ends import early_ends
+from cosmos_cli.rerun.early_ends import HOST, early_ends
 from cosmos_cli.rerun.recorded_run import FlownRun, UsedDevice
 from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.plural import counted
@@ -78,11 +78,7 @@ def make_rerun(recorded: FlownRun) -> RerunScenario:
         scenario=scenario,
         remarks=tuple(dict.fromkeys([*remarks, *carried.remarks])),
         left_out=tuple(carried.left_out),
-        ends={
-            name: last_s
-            for name, last_s in early_ends(recorded.agents).items()
-            if recorded.is_cut_off or name in recorded.killed
-        },
+        ends=_ends(recorded),
         unlike=() if config.time.is_lockstep else tuple(told["unlike"]),
     )
 
@@ -94,6 +90,18 @@ def _cure(recorded: FlownRun) -> str:
     if today is None or today.base_directory != folder or not is_file(simulation):
         return ""
     return f"; where {simulation} is gone, or was changed since, fly the run's own copy with --as-recorded"
+
+
+def _ends(recorded: FlownRun) -> dict[str, float]:
+    """Return who ended before others, or, all with the host, before the rerun does, each with the time of its last tick, s."""
+    if recorded.cut_s is not None:
+        ends = {name: agent.last_s for name, agent in recorded.agents.items()}
+        return {**ends, HOST: min(ends.values())}
+    return {
+        name: last_s
+        for name, last_s in early_ends(recorded.agents).items()
+        if recorded.is_cut_off or name in recorded.killed
+    }
 
 
 def _checked(recorded: FlownRun, values: Mapping[str, Any], carried: CarriedOver) -> ScenarioFile:

@@ -9,11 +9,11 @@ import numpy as np
 from cosmos_cli.evidence.expectations.accumulators import Flags, Floats, holds
 from cosmos_cli.evidence.expectations.records import Batch, RecordSource
 from cosmos_cli.models.expectation import HeldBounds, owner_of, scaled
-from madns_runtime.conditions.condition import HOST
+from madns_runtime.conditions.condition import HOST, ValueBounds
 from madns_runtime.units import conversion
 
 CHANGES_MAX = 1_000_000
-"""Changes of one agent between holding and not that are kept."""
+"""Changes of one agent between holding and not that are kept; records, of one whose times go back."""
 
 
 class TooManyChanges(Exception):
@@ -29,12 +29,15 @@ class HeldTimes:
         source: Where its records come from.
 
     Raises:
-        TooManyChanges: It changes more often than CHANGES_MAX times.
+        TooManyChanges: It changes more often than CHANGES_MAX times, or its times go back among more records.
     """
 
     def __init__(self, held: HeldBounds, source: RecordSource) -> None:
         self._changes: dict[str, list[tuple[Floats, Flags]]] = {}
         self._counts: dict[str, int] = {}
+        self._newest_s: dict[str, float] = {}
+        self._goes_back: set[str] = set()
+        """Agents whose records are not in the order of their times, as of messages that overtook each other."""
         self._own: set[str] = set()
         """Agents that recorded it themselves: what the host's half records of them under that name is not looked at."""
         self._names_agents = False
@@ -46,6 +49,8 @@ class HeldTimes:
             bounds = scaled(held.bounds, factor)
             for batch in self._batches(held, source):
                 self._add(batch, holds(bounds, batch.values), held)
+            if self._goes_back:
+                self._put_in_order(held, source, bounds)
 
     def during(self, agent: str, t_s: Floats) -> Flags:
         """Tell of each time whether the newest record of the condition until then holds."""
@@ -75,6 +80,10 @@ class HeldTimes:
             self._own.add(agent)
         elif agent in self._own:
             return
+        newest_s = np.maximum.accumulate(np.append(self._newest_s.get(agent, 0.0), batch.t_s))
+        self._newest_s[agent] = float(newest_s[-1])
+        if (batch.t_s < newest_s[:-1]).any():
+            self._goes_back.add(agent)
         known = self._changes.setdefault(agent, [])
         before = known[-1][1][-1] if known else not states[0]
         changed = np.flatnonzero(np.diff(states, prepend=before))
@@ -85,3 +94,22 @@ class HeldTimes:
             raise TooManyChanges(
                 f"{held.stream}.{held.field} of {batch.agent} changes more than {CHANGES_MAX} times between holding and not"
             )
+
+    def _put_in_order(self, held: HeldBounds, source: RecordSource, bounds: ValueBounds) -> None:
+        """Follow those anew whose times go back, by all of their records: what is between two changes counts, too."""
+        kept: dict[str, list[tuple[Floats, Flags]]] = {agent: [] for agent in self._goes_back}
+        counts = dict.fromkeys(kept, 0)
+        for batch in self._batches(held, source):
+            agent = owner_of(batch.agent)
+            if agent not in kept or (batch.is_of_host and agent in self._own):
+                continue
+            kept[agent].append((batch.t_s, holds(bounds, batch.values)))
+            counts[agent] += len(batch.t_s)
+            if counts[agent] > CHANGES_MAX:
+                raise TooManyChanges(
+                    f"{held.stream}.{held.field} of {batch.agent} has more than {CHANGES_MAX} records, and their times go back"
+                )
+        for agent, parts in kept.items():
+            times, states = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+            order = np.argsort(times, kind="stable")
+            self._changes[agent] = [(times[order], states[order])]

@@ -412,6 +412,27 @@ def test_records_without_a_time_are_matched_among_those_of_the_agents_that_are_c
     assert diff(capsys, "1", "2", "--streams", "ranks", "--expect-same")[0] == 1
 
 
+def record_device(made, value):
+    """Record a device of agent-02, and one of the inventory."""
+    gyro = StreamSchema("gyro", (Field("t_s", "s"), Field("gyro", "rad/s")))
+    for folder, own in (("agent-02/imu", value), ("pi02/clock", 1.0)):
+        recorder = made.recorder(f"devices/{folder}", folder, gyro)
+        recorder.record("gyro", (0.0, own))
+        recorder.close()
+
+
+def test_devices_of_agents_that_are_not_chosen_are_not_compared(make, capsys):
+    make(lambda made: record_device(made, 1.0)), make(lambda made: record_device(made, 2.0))
+
+    code, document = diff(capsys, "1", "2", "--agents", "agent-01", "--expect-same")
+
+    assert code == 0
+    assert {name for name in streams_of(document) if name.startswith("device")} == {
+        "device_clock.gyro"
+    }
+    assert diff(capsys, "1", "2", "--agents", "agent-0[12]", "--expect-same")[0] == 1
+
+
 def test_run_that_is_not_collected_is_bad_input_with_advice(make, tmp_path, capsys):
     make()
     SyntheticRun(tmp_path / "runs")

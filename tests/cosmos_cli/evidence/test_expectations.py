@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cosmos_cli.evidence.expectations import accumulators, records
+from cosmos_cli.evidence.expectations import accumulators, held_times, records
 from cosmos_cli.evidence.expectations.judge import judge_expectations
 from cosmos_cli.evidence.verdict import conclusion_of_expectations
 from cosmos_cli.models.expectation import Expectation, HeldBounds
@@ -297,6 +297,26 @@ def test_records_count_only_while_a_condition_on_another_stream_holds(monkeypatc
 
     wanted = ((T_S >= 10.0) & (T_S < 30.0)) | (T_S >= 90.0)
     assert result.got == np.count_nonzero(wanted)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 100])
+def test_a_condition_holds_by_its_newest_record_where_times_go_back(rows, monkeypatch):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    times_s = [10.0, 20.0, 30.0, 25.0, 40.0, 25.0, 60.0, 50.0, 55.0, 90.0]
+    on = [1, 1, 1, 0, 1, 1, 1, 0, 0, 1]
+    columns = {"t_s": np.array(times_s), "on": np.array(on, float)}
+    mode = FakeTable("mode", (Field("t_s", "s"), Field("on")), {"a": columns})
+    held = HeldBounds(stream="mode", field="on", bounds=ValueBounds.equals(1.0))
+    many = {"statistic": "count", "bounds": ValueBounds.above(0.0), "agents": ("a",)}
+
+    (result,) = judge(expect(**many, meanwhile=held), tables={**TABLES, "mode": mode}).results
+
+    wanted = ((T_S >= 10.0) & (T_S < 50.0)) | (T_S >= 60.0)
+    assert result.got == np.count_nonzero(wanted)
+
+    monkeypatch.setattr(held_times, "CHANGES_MAX", 9)
+    (result,) = judge(expect(**many, meanwhile=held), tables={**TABLES, "mode": mode}).results
+    assert result.expected == "x (mode.on of a has more than 9 records, and their times go back)"
 
 
 def test_what_the_host_says_of_one_agent_holds_for_no_other():

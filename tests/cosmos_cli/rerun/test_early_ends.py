@@ -1,9 +1,10 @@
 """What a rerun has of agents after their last ticks on record is not compared, and told."""
 
+import dataclasses
 import shutil
 
 import pytest
-from harness.synthetic_run import SyntheticRun
+from harness.synthetic_run import SyntheticRun, make_config
 
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.diff.compare import Comparison
@@ -217,3 +218,41 @@ def test_an_agent_without_ticks_that_nobody_killed_on_purpose_is_refused(tmp_pat
 
 def test_an_agent_that_lives_to_the_end_of_a_complete_run_ends_with_it(tmp_path):
     assert make_rerun(recorded_by(tmp_path, 199)).ends == {}
+
+
+@pytest.mark.parametrize(
+    "told", [{"status": "interrupted"}, {"status": "aborted", "who": "operator"}, None]
+)
+def test_a_run_in_lockstep_that_was_cut_off_is_cut_off_again_and_compared_up_to_there(
+    tmp_path, told
+):
+    config = make_config(2)
+    config = dataclasses.replace(
+        config, time=dataclasses.replace(config.time, mode="lockstep"), on_agent_loss="abort"
+    )
+    made = SyntheticRun(tmp_path, config)
+    (made.run.path / "scenario.yaml").write_text("name: synthetic\nsimulation: counter\n")
+    for name in made.names:
+        made.write_agent(name, last=121)
+    result = None if told is None else made.result(**told)
+    finish_run(made.run, result, made.expected, has_report=False)
+
+    recorded = read_recorded_run(made.run, "last", None)
+    flown = make_rerun(recorded)
+
+    assert recorded.cut_s == pytest.approx(12.0)
+    (end,) = flown.scenario.scenario.timeline
+    assert end == {"action": "stop", "at_s": pytest.approx(12.05)}
+    assert flown.ends == dict.fromkeys(("agent-01", "agent-02", "host"), pytest.approx(11.8))
+    assert any("it was cut off at 12 s" in remark for remark in flown.remarks)
+
+
+def test_a_run_in_lockstep_that_failed_by_itself_fails_again(tmp_path):
+    config = make_config(1)
+    config = dataclasses.replace(config, time=dataclasses.replace(config.time, mode="lockstep"))
+    made = SyntheticRun(tmp_path, config)
+    made.write_agent("agent-01", last=121)
+    result = made.result(status="failed", who="agent-01", reason="step raised")
+    finish_run(made.run, result, made.expected, has_report=False)
+
+    assert read_recorded_run(made.run, "last", None).cut_s is None

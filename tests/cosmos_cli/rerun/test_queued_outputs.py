@@ -98,6 +98,13 @@ agents: {count: 1, tick_hz: 10}
 time: {mode: lockstep, duration_s: 1}
 hardware: {armed: true, devices: [{name: pulser, kind: "./pulser.py:Pulser"}]}
 """
+SAMPLE = StreamSchema(
+    "pulse",
+    (
+        *(Field("t_s", "s"), Field("number", "", "int")),
+        *(Field("age_us", "us", "int"), Field("pulse", "s")),
+    ),
+)
 FRAME = StreamSchema(
     "pulse",
     (
@@ -273,3 +280,25 @@ def test_the_safe_value_of_a_profile_that_had_run_out_is_no_difference(tmp_path)
 
     assert (found.compared, found.different, found.left_out) == (3, 0, 1)
     assert (told.compared, told.different) == (4, 1)
+
+
+@pytest.mark.parametrize(("fault_s", "different"), [(0.97, 0), (0.5, 2)])
+def test_what_the_last_step_wrote_is_no_difference_where_a_fault_came_behind_it(
+    tmp_path, fault_s, different
+):
+    rerun = [(0.7, 1.0), (0.8, 1.0)]
+    fault = (fault_s, "fault", {"action": "bias", "value": 1.0})
+
+    found = compared(tmp_path, [*rerun, (0.9, 1.0), (0.9, 2.0)], rerun, events=[fault])
+
+    assert (found.different, found.left_out) == (different, 2 - different)
+
+
+def test_a_sample_that_came_behind_the_last_tick_is_not_seen_though_it_was_taken_before(tmp_path):
+    rerun = [(0.75, 50_000, 1.0), (0.8, 50_000, 2.0)]
+    fault = (0.97, "fault", {"action": "bias", "value": 1.0})
+    recorded = [*rerun, (0.9, 50_000, 3.0)]
+
+    found = compared(tmp_path, recorded, rerun, events=[fault], schema=SAMPLE)
+
+    assert (found.compared, found.different, found.left_out) == (2, 0, 1)
