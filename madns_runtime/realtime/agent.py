@@ -341,8 +341,10 @@ class AgentRunner:
         )
         self._takes_data = False
         self._cancel_timers()
-        self._journal.event("emergency", reason=reason)
-        self._journal.say("critical", f"emergency shutdown: {reason}")
+        if (
+            not self._faults.has_killed
+        ):  # then its process goes on for others, and it says no more than one that has its own
+            self._journal.emergency(reason)
         self._actions.leave_clock()
         self.half.abandon()
         self._reactor.end_if_forked()

@@ -114,6 +114,25 @@ def test_what_an_agent_learns_of_the_clock_is_followed_until_simulated_time_begi
     assert followed == told_devices == [t_s] * times
 
 
+@pytest.mark.parametrize(("has_killed", "told"), [(True, []), (False, ["agent-2: why"])])
+def test_an_agent_that_a_fault_ends_records_no_emergency_where_others_keep_its_process(
+    has_killed, told
+):
+    said = []
+    runner = AgentRunner.__new__(AgentRunner)
+    runner._ticks = SimpleNamespace(pacer=SimpleNamespace(is_over=False))
+    runner._faults = SimpleNamespace(has_killed=has_killed)
+    runner._journal = SimpleNamespace(emergency=said.append)
+    runner._actions = SimpleNamespace(leave_clock=lambda: None)
+    runner.half = SimpleNamespace(abandon=lambda: None)
+    runner._reactor = SimpleNamespace(end_if_forked=lambda: None)
+    runner._cancel_timers = runner._close_records = lambda: None
+
+    runner._end_early("agent-2: why", is_own=True)
+
+    assert said == told
+
+
 def test_the_last_agent_of_a_process_that_a_fault_ends_keeps_the_socket_for_its_return(monkeypatch):
     waiting, awaited_at_its_end = [], []
     monkeypatch.setattr(
