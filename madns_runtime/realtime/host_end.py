@@ -7,7 +7,7 @@ supervisor ends with its agents, which find no host when they return.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from functools import partial
 from pathlib import Path
 
@@ -19,20 +19,32 @@ LOOK_S = 1.0
 HOST_ENDED = "the host has ended"
 
 
-def watch_host_end(launch: AgentLaunch, reactor: Reactor, end: Callable[[str], None]) -> None:
+def watch_host_end(
+    launch: AgentLaunch, reactor: Reactor, children: Sized, end: Callable[[str], None]
+) -> None:
     """
     Look for the host's end every second from now on.
 
     Args:
         launch: The supervisor's.
         reactor: The loop.
-        end: Called once, with why.
+        children: Processes that live. Without any the end is at once; those that still close their records have time for it.
+        end: Called then, with why.
     """
-    _look_at(Path(launch.directory, "host", RESULT_FILE), reactor, end)
+    result = Path(launch.directory, "host", RESULT_FILE)
+    grace_s = launch.config.timeouts.shutdown_s
+    _look(result, reactor, partial(_end_soon, reactor, children, partial(end, HOST_ENDED), grace_s))
 
 
-def _look_at(result: Path, reactor: Reactor, end: Callable[[str], None]) -> None:
+def _look(result: Path, reactor: Reactor, found: Callable[[], None]) -> None:
     if result.exists():
-        end(HOST_ENDED)
+        found()
     else:
-        reactor.call_at(reactor.now_s() + LOOK_S, partial(_look_at, result, reactor, end))
+        reactor.call_at(reactor.now_s() + LOOK_S, partial(_look, result, reactor, found))
+
+
+def _end_soon(reactor: Reactor, children: Sized, end: Callable[[], None], grace_s: float) -> None:
+    if children:
+        reactor.call_at(reactor.now_s() + grace_s, end)
+    else:
+        end()

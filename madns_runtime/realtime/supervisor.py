@@ -126,7 +126,7 @@ class Supervisor:
         outlive_parent()
         if self._launch.is_detached:
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
-            watch_host_end(self._launch, self._reactor, self._end)
+            watch_host_end(self._launch, self._reactor, self._children, self._end)
         reactor = self._reactor
         reactor.on_signal(signal.SIGCHLD, self._reap)
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
