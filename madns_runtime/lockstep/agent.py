@@ -99,6 +99,8 @@ class LockstepAgent:
         self._core = core
         self.is_made = False
         """Whether its half is made."""
+        self.is_killed = False
+        """Whether a fault has ended it on purpose."""
         self.stepping = index * POSITIONS + STEPPING
         self.is_running = False
         self.deadlines_broken = 0

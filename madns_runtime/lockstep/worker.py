@@ -342,6 +342,7 @@ class Worker:
         self._clock.t_s = t_s
         for agent in [each for each in self._agents if each.index in indices]:
             if fault.word == KILL:
+                agent.is_killed = True
                 agent.journal.event("killed", **fault.loss)
                 self._lose(agent, AgentFailed(agent.index, fault.reason))
                 continue
@@ -382,8 +383,7 @@ class Worker:
         for agent in self._agents:
             self._position[0] = agent.index * POSITIONS + frames.CLOSING
             if reason is not None:
-                agent.journal.event("emergency", reason=reason)
-                agent.journal.say("critical", f"emergency shutdown: {reason}")
+                agent.journal.emergency(reason)
                 self._forks.abandon(agent.index, agent.abandon, self._line)
             losses = agent.journal.device_losses(agent.devices.hardware.losses())
             counts = {**losses, **agent.journal.close().to_mapping()}

@@ -20,8 +20,10 @@ class WorkerLosses:
 
     def add(self, agent: LockstepAgent, reason: str) -> None:
         """Close an agent's records, and keep word of its loss; its devices outlive it."""
-        agent.journal.event("emergency", reason=reason)
-        agent.journal.say("critical", f"emergency shutdown: {reason}")
+        if (
+            not agent.is_killed
+        ):  # as of a process that a fault ends: it says that it is killed, and no more
+            agent.journal.emergency(reason)
         self._devices[agent.index] = agent.devices
         losses = agent.journal.device_losses(agent.devices.hardware.losses())
         self._untold[agent.index] = Loss(

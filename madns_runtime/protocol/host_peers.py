@@ -59,6 +59,8 @@ class Peer:
     """Pings not answered yet: the agent's time, and when it came. Older ones give way: they would tell less of its clock."""
     timer_s: float = float("inf")
     loss_reason: str | None = None
+    killed_s: float | None = None
+    """When it was last ordered to end without a word; None if it never was."""
     report: Mapping[str, Any] = field(default_factory=dict)
     summary: Mapping[str, Any] = field(default_factory=dict)
     records: Mapping[str, Any] = field(default_factory=dict)
@@ -99,6 +101,8 @@ class Roster:
         """Running agents by the prefix of their datagrams."""
         self.awaits_returns = False
         """Whether agents that are lost on purpose are to return: a run without any other goes on."""
+        self.are_returns_cut_off = False
+        """Whether others were to return when the run is over, by a stop: without any other it lasts until then."""
         self._timeouts = timeouts
         self._events = events
         self._wakefulness = Wakefulness(timeouts.silence_s, now_s)
@@ -112,18 +116,22 @@ class Roster:
         settled = (*phases, Phase.LOST)
         return tuple(name for name, peer in self.peers.items() if peer.phase not in settled)
 
-    def await_returns(self, are_due: bool) -> None:
-        """Note whether agents that are lost on purpose are to return."""
-        self.awaits_returns = are_due
+    def await_returns(self, are_due: bool, *, are_cut_off: bool = False) -> None:
+        """Note whether agents that are lost on purpose are to return, and whether others were, had no stop come before."""
+        self.awaits_returns, self.are_returns_cut_off = are_due, are_cut_off
 
     @property
     def are_all_lost(self) -> bool:
-        """Whether no agent is left, and none is to return."""
-        return not self.awaits_returns and not self.names_outside()
+        """Whether no agent is left, and none is to return, or was before a stop."""
+        return not self._has_absent and self.is_empty
 
     def are_settled(self, phase: Phase) -> bool:
         """Tell whether every agent that is not lost is in *phase*, and one is, or none is to return."""
-        return not self.names_outside(phase) and not (self.awaits_returns and self.is_empty)
+        return not self.names_outside(phase) and not (self._has_absent and self.is_empty)
+
+    @property
+    def _has_absent(self) -> bool:
+        return self.awaits_returns or self.are_returns_cut_off
 
     @property
     def is_empty(self) -> bool:
@@ -144,7 +152,8 @@ class Roster:
         """Take note that agents, by name, are lost and why; it is told as a loss while the host *is_live*."""
         for name, reason in reasons.items():
             peer = self.peers[name]
-            peer.loss_reason = reason
+            # One that is being killed is not expelled: by the order that waits for it, it may return.
+            peer.loss_reason = reason if peer.killed_s is None else None
             self.move(peer, Phase.LOST, reason)
             if peer.link is not None:
                 # What it has not acknowledged is lost, and counted so; a last word may still reach it.
@@ -166,8 +175,16 @@ class Roster:
         if state not in HOST_LIVE:
             return silent
         for name, peer in self.peers.items():
-            limit_s = agent_silence_limit_s(state, peer.phase, self._timeouts, is_over=is_over)
-            if now_s - max(peer.heard_s, self._wakefulness.blameless_until_s) > limit_s:
+            killed_s = peer.killed_s
+            limit_s = agent_silence_limit_s(
+                state,
+                peer.phase,
+                self._timeouts,
+                is_over=is_over,
+                is_being_killed=killed_s is not None,
+            )
+            heard_s = max(peer.heard_s, self._wakefulness.blameless_until_s, killed_s or 0.0)
+            if now_s - heard_s > limit_s:
                 silent[name] = f"silent for {limit_s:g} s while {peer.phase.value}"
         return silent
 
@@ -301,7 +318,7 @@ class HostLinks:
             peer.retired_counters.append(peer.link.counters.to_mapping())
             peer.retired_records.append(peer.records)
             peer.records = {}
-        peer.link = link
+        peer.link, peer.killed_s = link, None
         peer.incarnation_ids_seen.add(link.incarnation_id)
         peer.pings.clear()
         peer.timer_s = _NEVER

@@ -147,6 +147,10 @@ class HostSession:
         if pid is None or peer.pid is None or pid == peer.pid:
             self._lose({agent: how}, now_s)
 
+    def agent_is_being_killed(self, agent: str, now_s: float) -> None:
+        """Take note that an agent was ordered to end without a word: nobody else may be there to tell that it did."""
+        self.peers[agent].killed_s = now_s
+
     def cleaned_up(self) -> None:
         """Simulation and executor are closed."""
         self._fire(HostEvent.CLEANED_UP)
@@ -226,7 +230,8 @@ class HostSession:
             lost = self._roster.find_silent(self.state, now_s, is_over=now_s > self._end_host_s)
             self._lose(lost, now_s)
             if self._roster.is_empty and now_s > self._end_host_s:
-                self._progress(now_s)  # stopped while all were away: none is to return before that
+                self._roster.are_returns_cut_off = False  # stopped while all were away
+                self._progress(now_s)
             self._check_state_deadline(now_s)
 
     def next_event(self) -> HostSessionEvent | None:
@@ -378,7 +383,7 @@ class HostSession:
             reason = f"no {word} in {waited_s:g} s"
             self._roster.awaits_returns = False
             self._lose(dict.fromkeys(self._roster.names_outside(phase), reason), now_s)
-            if self._roster.is_empty:
+            if self._roster.are_all_lost:
                 self.emergency(", ".join(self.peers), f"{reason}: none has returned", now_s)
         elif state is HostState.SIMULATION_SETUP:
             self.emergency("host", f"setup of the simulation took over {waited_s:g} s", now_s)

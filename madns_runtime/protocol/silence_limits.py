@@ -11,6 +11,9 @@ from madns_runtime.protocol.states import AgentState, HostState
 STALL_S: Final = 1.0
 """A session that was not called for this long, though it was due, was itself frozen, and blames nobody for silence."""
 
+KILLED_SILENCE_S: Final = 2.0
+"""An agent that is ordered to end without a word, and says none for this long, has done so."""
+
 _NEVER: Final = float("inf")
 
 
@@ -55,7 +58,12 @@ def host_silence_limit_s(state: AgentState, timeouts: Timeouts) -> float:
 
 
 def agent_silence_limit_s(
-    state: HostState, phase: Phase, timeouts: Timeouts, *, is_over: bool
+    state: HostState,
+    phase: Phase,
+    timeouts: Timeouts,
+    *,
+    is_over: bool,
+    is_being_killed: bool = False,
 ) -> float:
     """
     Return how long an agent may say nothing: longer where its plug-in or its disk keeps it busy.
@@ -65,10 +73,13 @@ def agent_silence_limit_s(
         phase: The agent's.
         timeouts: The run's deadlines.
         is_over: Whether the simulated time is.
+        is_being_killed: Whether it was ordered to end without a word.
     """
     if phase in (Phase.ABSENT, Phase.STOPPED, Phase.LOST) or state is HostState.BEGIN_SHUTDOWN:
         return _NEVER  # nobody to hear, or a state whose own deadline waits for all
     limit_s = timeouts.silence_s
+    if is_being_killed and phase in (Phase.RUNNING, Phase.COMPLETE):
+        return min(limit_s, KILLED_SILENCE_S)
     if state is HostState.HOST_SIMULATION_READY or phase is Phase.SETTING_UP:
         # Its half is being set up, or that of an agent which shares its process.
         return limit_s + timeouts.agent_setup_s

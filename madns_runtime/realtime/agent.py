@@ -133,8 +133,7 @@ class AgentRunner:
         )
         self._usage_timer = reactor.call_at(math.inf, self._record_usage)  # at no time, as yet
         self._outcome = AgentOutcome(as_ordered=False, reason="did not end")
-        self._is_closed = False
-        self._takes_data = True
+        self._is_closed, self._takes_data = False, True
 
     def _make_ticks(self, seat: LoopSeat, recorder: Recorder) -> PacedTicks:
         calls = TickCalls(
@@ -143,7 +142,7 @@ class AgentRunner:
             end_if_forked=self._reactor.end_if_forked,
             failed=self._step_failed,
             ended=self._ticks_over,
-            is_running=self._is_running,
+            is_running=lambda: self._session.state is AgentState.RUN_SIMULATION,
             report_if_due=self._report_if_due,
         )
         return PacedTicks(
@@ -186,6 +185,8 @@ class AgentRunner:
             calls[METHOD] = IDLE
             if not self._port.must_flush:
                 return
+        elif message is not NO_DATA:
+            self._port.too_late += 1
         self._pump()
 
     def _session_due(self) -> None:
@@ -248,7 +249,7 @@ class AgentRunner:
         elif isinstance(message, AgentFault):
             self._faults.take(message)
         elif not self._takes_data:
-            return  # its half is called no more
+            self._port.too_late += 1  # its half is called no more
         elif isinstance(message, ActionOrder):
             self._actions.take(message)
         else:
@@ -288,9 +289,6 @@ class AgentRunner:
     def _step_failed(self, error: BaseException) -> None:
         self._fail(self.half.failure("step", error))
         self._pump()
-
-    def _is_running(self) -> bool:
-        return self._session.state is AgentState.RUN_SIMULATION
 
     def _prepare_tick(self, t_s: float) -> bool:
         """Hand in what comes with the tick at simulated time *t_s*; return whether the agent goes on."""
@@ -341,8 +339,10 @@ class AgentRunner:
         )
         self._takes_data = False
         self._cancel_timers()
-        self._journal.event("emergency", reason=reason)
-        self._journal.say("critical", f"emergency shutdown: {reason}")
+        if (
+            not self._faults.has_killed
+        ):  # then its process goes on for others, and it says no more than one that has its own
+            self._journal.emergency(reason)
         self._actions.leave_clock()
         self.half.abandon()
         self._reactor.end_if_forked()

@@ -30,11 +30,14 @@ class AgentFaults:
         self._ticks = ticks
         self._journal = journal
         self._killed = killed
+        self.has_killed = False
+        """Whether one of them has ended the agent."""
 
     def take(self, order: AgentFault) -> None:
         """Begin or end a fault."""
         if order.word in LOSSES:
             self._journal.event("killed", **order.loss)
+            self.has_killed = True
             self._killed(order.reason, order.loss["returns_after_s"])
             return
         faults = self._ticks.hinder(order)

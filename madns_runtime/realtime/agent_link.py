@@ -93,6 +93,8 @@ class AgentPort:
         """Simulated time zero on the host's clock; None before it is known."""
         self._rejoined_at_s: float | None = None
         """Simulated time zero on this machine's clock, as an agent that rejoins knows it while it sets up."""
+        self.too_late = 0
+        """Messages and orders of the host's that came when the agent's half was called no more."""
         self.must_flush = False
         """Whether something waits to be sent."""
         self._lead_s = config.timeouts.start_lead_s

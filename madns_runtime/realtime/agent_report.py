@@ -95,6 +95,7 @@ class AgentReport:
             "loop": self.port.process.loop(),
             "between_agents": self.port.mailbox.counts(),
             "held_dropped": self.port.session.held_dropped_count,
+            "too_late": self.port.too_late,
             "malformed": self.port.session.malformed_count,
         }
 

@@ -30,6 +30,7 @@ class HostFaults:
         self.intended = IntendedLosses()
         self._goes_on = config.on_agent_loss == "continue"
         self._duration_s = config.time.duration_s
+        self._is_stopped = False
         self._port = port
         self._half = half
         self._pump = core.pump
@@ -75,7 +76,8 @@ class HostFaults:
     def end_at(self, end_s: float) -> None:
         """Let the run end at simulated time *end_s*, s: agents that were to return after it are not waited for."""
         self._duration_s = end_s
-        self._port.session.await_returns(self.intended.are_expected(end_s))
+        self._is_stopped = True
+        self._await_returns()
 
     # Agents ---------------------------------------------------------------------------------------
 
@@ -100,9 +102,10 @@ class HostFaults:
             # Who is being killed is as good as gone: a second order would not be heard, and says when it returns.
             if not self.intended.is_coming(agent) and self._send(agent, order):
                 self.intended.order(agent, why, returns_s=returns_s)
+                self._port.session.agent_is_being_killed(agent, monotonic())
             else:
                 absent.append(agent)
-        self._port.session.await_returns(self.intended.are_expected(self._duration_s))
+        self._await_returns()
         return absent
 
     def _worn_out(self, agents: Sequence[str]) -> list[str]:
@@ -136,7 +139,13 @@ class HostFaults:
     def returned(self, agent: str) -> None:
         """Note that an agent is back."""
         self.intended.returned(agent)
-        self._port.session.await_returns(self.intended.are_expected(self._duration_s))
+        self._await_returns()
+
+    def _await_returns(self) -> None:
+        are_due = self.intended.are_expected(self._duration_s)
+        # A stop is no loss of those who would be back without it.
+        are_cut_off = self._is_stopped and not are_due and self.intended.are_expected(math.inf)
+        self._port.session.await_returns(are_due, are_cut_off=are_cut_off)
 
     # Messages -------------------------------------------------------------------------------------
 

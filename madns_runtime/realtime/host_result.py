@@ -167,7 +167,8 @@ def _agent_result(
             records.pop("messages", None),
             sum(told.get("held_dropped", 0) for told in incarnations),
             ended_on_purpose=ended_on_purpose,
-        ),
+        )
+        | {"too_late": sum(told.get("too_late", 0) for told in lives)},
         "records": records,
         "simulation": simulation,
     }

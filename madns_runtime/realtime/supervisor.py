@@ -36,6 +36,7 @@ from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
 from madns_runtime.realtime.agent_calls import AgentCalls, LoopSeat
 from madns_runtime.realtime.agent_process import AgentProcess
 from madns_runtime.realtime.agent_report import AgentOutcome, how_ended, make_reason_pipe
+from madns_runtime.realtime.host_end import watch_host_end
 
 RESTART_DELAY_S = 0.2
 KILL_GRACE_S = 3.0
@@ -125,6 +126,7 @@ class Supervisor:
         outlive_parent()
         if self._launch.is_detached:
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
+            watch_host_end(self._launch, self._reactor, self._children, self._end)
         reactor = self._reactor
         reactor.on_signal(signal.SIGCHLD, self._reap)
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))

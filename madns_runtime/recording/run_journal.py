@@ -60,6 +60,11 @@ class RunJournal:
             with contextlib.suppress(MachineError):
                 self.recorder.record(EVENTS.name, {**when, **values})
 
+    def emergency(self, reason: str) -> None:
+        """Record that whoever records here ends before the run does, and why; also in the log."""
+        self.event("emergency", reason=reason)
+        self.say("critical", f"emergency shutdown: {reason}")
+
     def device_losses(self, losses: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
         """Tell what devices, by name, and an agent had no room for, by kind; also in the log. Return it for the host."""
         for device, counts in losses.items():

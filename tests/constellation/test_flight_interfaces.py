@@ -26,8 +26,10 @@ from madns_runtime.simulations.constellation.flight.asked_ticks import UNANSWERE
 from madns_runtime.simulations.constellation.flight.interface.program import FlightProgram
 from madns_runtime.simulations.constellation.flight.interface.socket_transports import (
     SocketLink,
+    UdpLink,
     resolve_both,
 )
+from madns_runtime.simulations.constellation.flight.interface.transport import READ_BYTES
 from madns_runtime.simulations.constellation.flight.process import ExternalFlight
 
 pytestmark = pytest.mark.process
@@ -297,6 +299,21 @@ def test_datagrams_go_to_a_place_that_is_known(tmp_path):
 
     assert ship.summary["answers"] == 10
     board.close()
+
+
+def test_of_many_datagrams_at_once_the_rest_waits_for_the_next_look():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
+        board.bind(("127.0.0.1", 0))
+        link = UdpLink("udp", ("127.0.0.1", 0), board.getsockname(), family=socket.AF_INET)
+        link.open()
+        for number in range(4):
+            board.sendto(bytes([number]) * 30_000, ("127.0.0.1", int(link.address.split(":")[1])))
+
+        looks = [link.receive() for _ in range(3)]
+        link.close()
+
+    assert [len(one or b"") for one in looks] == [90_000, 30_000, 0]
+    assert len(looks[0]) < READ_BYTES + 30_000
 
 
 @pytest.fixture

@@ -576,6 +576,24 @@ def test_commands_before_the_first_tick_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "doing", ["delta_v((1, 1, 1), at_s=0.1)", "ballistic(0.01, at_s=9.0)", "send('*', 'bye')"]
+)
+def test_commands_and_messages_behind_the_last_tick_are_refused(tmp_path, doing):
+    text = (
+        "class G:\n"
+        "    def setup(self, context): self.context = context\n"
+        f"    def finish(self): self.context.{doing}"
+    )
+    ship = Ship(tmp_path, text)
+    ship.run(0.1)
+
+    with pytest.raises(BlamedError, match=r"no tick follows finish\(\).*\(guidance.py:3\)"):
+        ship.agent.finish()
+
+    assert not ship.context.records["commands"]
+
+
+@pytest.mark.parametrize(
     ("text", "words"),
     [
         ("G = 3", "guidance.py:G"),

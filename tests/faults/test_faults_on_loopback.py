@@ -171,7 +171,8 @@ def test_of_a_process_that_others_share_only_the_half_is_dropped_and_it_returns_
     assert len(pids) == 1
     # Its records were closed, not cut.
     said = [event["event"] for event in events(folder, "agents/agent-01")]
-    assert said[-3:] == ["killed", "emergency", "end"] or "killed" in said and said[-1] == "end"
+    assert "killed" in said and said[-1] == "end"
+    assert "emergency" not in said
     # The other half went on beside it: whatever tick a busy machine had it miss is told.
     ran = ticks(folder, "agent-04")
     missed = sum(row[3] for row in read_stream(folder / "agents/agent-04/ticks.jsonl").records())

@@ -174,7 +174,8 @@ def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_f
     assert at_host(run, kind="lost") == [(0.3, ["killed on purpose at t = 0.3 s for 0.3 s"])]
     assert at_host(run, kind="rejoined") == [(0.6, [])]
     said = [e["event"] for e in run.events_of("agents/agent-04")]
-    assert said == ["start", "killed", "emergency", "end"]
+    assert said == ["start", "killed", "end"]  # no emergency, which checks look for
+    assert not [row for row in run.records("agents/agent-04/log.jsonl") if row[2] == "critical"]
     assert returns_after_s(run) == 0.3
 
 

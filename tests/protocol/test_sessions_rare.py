@@ -270,6 +270,70 @@ def test_agents_silent_at_once_are_all_lost_and_named():
     assert declared == [h.EmergencyDeclared("agent-2, agent-3", reason)]
 
 
+def test_one_that_is_killed_on_purpose_is_missed_soon_though_nobody_tells_of_it():
+    w = world(count=2, policy="continue")
+    w.run_for(1.6)
+    w.host.agent_is_being_killed("agent-2", w.now_s)
+    w.frozen.add("agent-2")
+
+    w.run_for(1.9)
+    assert w.host.peers["agent-2"].phase is Phase.RUNNING
+    w.run_for(0.3)
+
+    assert w.host_event(h.AgentLost) == h.AgentLost("agent-2", "silent for 2 s while running")
+
+
+def test_a_run_whose_agents_were_all_killed_ends_well_when_it_is_stopped_before_they_return():
+    w = world(count=2, policy="continue")
+    w.run_for(1.6)
+    w.frozen.update(w.names)
+    for name in w.names:
+        w.host.agent_is_being_killed(name, w.now_s)
+    w.host.await_returns(True)
+    w.run_for(0.5)
+
+    w.host.await_returns(False, are_cut_off=True)
+    w.host.end_at(w.now_s + 0.2)
+    w.run_for(3)
+
+    assert w.host_event(h.AgentsComplete) is not None
+    assert w.host_event(h.EmergencyDeclared) is None
+
+
+def test_a_loss_between_a_stop_and_the_end_of_the_run_ends_it_no_earlier():
+    w = world(count=1, policy="continue")
+    w.run_for(1.6)
+    w.frozen.add("agent-1")
+    w.host.await_returns(False, are_cut_off=True)
+    w.host.end_at(w.now_s + 0.5)
+
+    w.host.agent_exited("agent-1", "killed by SIGKILL", w.now_s)
+    w.run_for(0.4)
+    assert w.host.state is HostState.SIMULATION_START
+    w.run_for(0.4)
+
+    assert w.host_event(h.AgentsComplete) is not None
+    assert w.host_event(h.EmergencyDeclared) is None
+
+
+def test_one_that_was_slow_to_hear_that_it_is_killed_is_not_expelled_and_may_return():
+    w = world(count=2, policy="continue")
+    w.run_for(1.6)
+    w.host.agent_is_being_killed("agent-2", w.now_s)
+    w.frozen.add("agent-2")
+    w.run_for(2.3)
+    assert w.host.peers["agent-2"].phase is Phase.LOST
+
+    w.frozen.clear()
+    w.run_for(0.5)
+
+    assert w.agent_saw("agent-2", a.ExpelledFromRun) is None
+    w.join("agent-2")
+    w.run_for(1)
+    assert w.host.peers["agent-2"].killed_s is None
+    assert w.host_event(h.AgentRejoined) == h.AgentRejoined("agent-2")
+
+
 def test_what_an_agent_missed_of_a_deadline_is_counted_as_lost_with_it():
     for sent in (["never read"], []):
         w = world(count=1)

@@ -6,7 +6,9 @@ import pytest
 
 from madns_runtime.config import Agents
 from madns_runtime.plugin.half import HalfFailed, RoleProgram
-from madns_runtime.protocol.events import ClockEstimated
+from madns_runtime.protocol.codec import NO_DATA
+from madns_runtime.protocol.events import ClockEstimated, HostDataReceived
+from madns_runtime.protocol.messages import ActionOrder
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.realtime import agent_process
 from madns_runtime.realtime.agent import AgentRunner
@@ -112,6 +114,43 @@ def test_what_an_agent_learns_of_the_clock_is_followed_until_simulated_time_begi
     runner._handle(ClockEstimated())
 
     assert followed == told_devices == [t_s] * times
+
+
+def test_what_comes_when_an_agents_half_is_called_no_more_is_counted():
+    heard = []
+    runner = AgentRunner.__new__(AgentRunner)
+    runner._port = SimpleNamespace(too_late=0)
+    runner._session = SimpleNamespace(receive_data=lambda data, now_s: data or NO_DATA)
+    runner._call = lambda *call: heard.append(call)
+    runner._actions = SimpleNamespace(take=heard.append)
+    runner._pump = lambda: None
+    runner._takes_data = False
+
+    runner._handle(HostDataReceived("reliable"))
+    runner._handle(HostDataReceived(ActionOrder(1, "stop", {}, 2.0, None, is_end=False)))
+    runner._take_datagram(b"best")
+    runner._take_datagram(b"")  # an acknowledgement, say
+
+    assert (runner._port.too_late, heard) == (3, [])
+
+
+@pytest.mark.parametrize(("has_killed", "told"), [(True, []), (False, ["agent-2: why"])])
+def test_an_agent_that_a_fault_ends_records_no_emergency_where_others_keep_its_process(
+    has_killed, told
+):
+    said = []
+    runner = AgentRunner.__new__(AgentRunner)
+    runner._ticks = SimpleNamespace(pacer=SimpleNamespace(is_over=False))
+    runner._faults = SimpleNamespace(has_killed=has_killed)
+    runner._journal = SimpleNamespace(emergency=said.append)
+    runner._actions = SimpleNamespace(leave_clock=lambda: None)
+    runner.half = SimpleNamespace(abandon=lambda: None)
+    runner._reactor = SimpleNamespace(end_if_forked=lambda: None)
+    runner._cancel_timers = runner._close_records = lambda: None
+
+    runner._end_early("agent-2: why", is_own=True)
+
+    assert said == told
 
 
 def test_the_last_agent_of_a_process_that_a_fault_ends_keeps_the_socket_for_its_return(monkeypatch):

@@ -20,6 +20,7 @@ class Session:
     def __init__(self) -> None:
         self.sent: list[tuple[str, AgentFault]] = []
         self.full: set[str] = set()
+        self.being_killed: list[str] = []
         self.peers = {name: SimpleNamespace(incarnation_ids_seen=["x"]) for name in ("a", "b")}
 
     def send(self, agent: str, order: AgentFault, *_: Any) -> bool:
@@ -28,8 +29,12 @@ class Session:
         self.sent.append((agent, order))
         return True
 
-    def await_returns(self, are_expected: bool) -> None:
-        del are_expected
+    def agent_is_being_killed(self, agent: str, now_s: float) -> None:
+        del now_s
+        self.being_killed.append(agent)
+
+    def await_returns(self, are_due: bool, *, are_cut_off: bool = False) -> None:
+        self.awaited = (are_due, are_cut_off)
 
 
 def some_faults(now_s: float = 10.0) -> tuple[HostFaults, Session]:
@@ -67,6 +72,7 @@ def test_a_second_kill_of_one_that_is_being_killed_does_not_say_when_it_returns(
     assert faults.begin(an_action(2, "kill", "a", "b", for_s=1.0)) == ["a"]
 
     assert [(agent, order.number) for agent, order in session.sent] == [("a", 0), ("b", 2)]
+    assert session.being_killed == ["a", "b"]
     assert faults.lost("a", 1)
     assert faults.intended.returns_s("a") is None
     assert faults.intended.returns_s("b") == 11.0
@@ -200,3 +206,15 @@ def test_one_that_is_killed_as_it_returns_is_lost_on_purpose_once_more() -> None
     assert faults.lost("a", 2)
     assert faults.intended.returns_s("a") == 11.0
     assert faults.intended.incarnations("a") == [1, 2]
+
+
+def test_who_was_to_return_after_a_stop_is_not_taken_for_lost_by_it() -> None:
+    faults, session = some_faults()
+    faults.begin(an_action(0, "kill", "a"))
+    assert session.awaited == (False, False)
+    faults.begin(an_action(1, "kill", "b", for_s=20.0))
+    assert session.awaited == (True, False)
+
+    faults.end_at(12.0)
+
+    assert session.awaited == (False, True)

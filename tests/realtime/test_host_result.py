@@ -34,6 +34,22 @@ def test_what_an_agent_could_not_hold_during_its_set_up_is_lost():
     assert result["agents"]["agent-01"]["records"]["held_dropped"] == 7
 
 
+def test_what_came_too_late_is_told_of_all_lives_of_an_agent():
+    peer = Peer(
+        name="agent-01",
+        index=1,
+        phase=Phase.STOPPED,
+        retired_counters=[LinkCounters().to_mapping()],
+        retired_records=[{"too_late": 2, "messages": LinkCounters().to_mapping()}],
+        records={"too_late": 3, "messages": LinkCounters().to_mapping()},
+    )
+    session: Any = SimpleNamespace(peers={"agent-01": peer}, refused={}, malformed_count=0)
+
+    result = HostReport(10.0).result(session, network={}, intended=IntendedLosses())
+
+    assert result["agents"]["agent-01"]["messages"]["too_late"] == 5
+
+
 def test_without_the_agents_own_count_nobody_knows_what_was_lost():
     assert result_of()["messages"]["reliable"]["lost"] is None
 

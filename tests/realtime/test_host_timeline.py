@@ -28,8 +28,12 @@ class Session:
         self.heard.append((agent, order.word, getattr(order, "t_s", 0.0)))
         return True
 
-    def await_returns(self, are_expected: bool) -> None:
-        self.awaited.append(are_expected)
+    def await_returns(self, are_due: bool, *, are_cut_off: bool = False) -> None:
+        del are_cut_off
+        self.awaited.append(are_due)
+
+    def agent_is_being_killed(self, agent: str, now_s: float) -> None:
+        del agent, now_s
 
     def end_at(self, end_host_s: float) -> None:
         self.end_host_s = end_host_s

@@ -51,6 +51,7 @@ class CommandDesk:
         self._vehicle = vehicle
         self._first_number = first_number
         self._tick: int | None = None
+        self._is_over = False
         self._t_s = -math.inf
         self._phase_s = 0.0
         self._in_tick = 0
@@ -65,6 +66,10 @@ class CommandDesk:
         self._tick, self._t_s, self._phase_s = tick, t_s, phase_s
         self._in_tick = 0
 
+    def end(self) -> None:
+        """Take no more commands: no tick follows in which one could be carried out."""
+        self._is_over = True
+
     def begin_answer(self) -> None:
         """Begin an answer to another tick, which may hold as many commands as any."""
         self._in_tick = 0
@@ -76,7 +81,7 @@ class CommandDesk:
         Raises:
             PluginError: It is none that a vehicle of this kind could carry out.
         """
-        check_running("delta_v", self._tick)
+        check_running("delta_v", self._tick, is_over=self._is_over)
         if frame not in get_args(CommandFrame):
             expected = ", ".join(get_args(CommandFrame))
             raise PluginError(f"delta_v: expected frame to be one of {expected}, got {frame!r}")
@@ -92,7 +97,7 @@ class CommandDesk:
         Raises:
             PluginError: It is none that a vehicle of this kind could carry out.
         """
-        check_running("torque", self._tick)
+        check_running("torque", self._tick, is_over=self._is_over)
         if self._vehicle.attitude is None:
             raise PluginError("torque: needs a vehicle with vehicles.attitude")
         duration_s = _duration("torque", duration_s)
@@ -106,7 +111,7 @@ class CommandDesk:
         Raises:
             PluginError: It is none that a vehicle of this kind could carry out.
         """
-        check_running("dipole", self._tick)
+        check_running("dipole", self._tick, is_over=self._is_over)
         attitude = self._vehicle.attitude
         if attitude is None or attitude.magnetorquers is None:
             raise PluginError("dipole: needs a vehicle with vehicles.attitude.magnetorquers")
@@ -121,7 +126,7 @@ class CommandDesk:
         Raises:
             PluginError: The vehicle cannot have it.
         """
-        check_running("ballistic", self._tick)
+        check_running("ballistic", self._tick, is_over=self._is_over)
         value = _number("ballistic", "ballistic_m2_kg", ballistic_m2_kg)
         limits = self._vehicle.ballistic_m2_kg_range
         if limits is None:
@@ -174,15 +179,19 @@ class CommandDesk:
         return number
 
 
-def check_running(name: str, tick: int | None) -> None:
+def check_running(name: str, tick: int | None, *, is_over: bool = False) -> None:
     """
     Check that flight software calls what it calls in a tick.
 
     Raises:
-        PluginError: There was none yet.
+        PluginError: There was none yet, or the last *is_over*.
     """
     if tick is None:
         raise PluginError(f"{name}: there is no time before the first tick; call it in step()")
+    if is_over:
+        raise PluginError(
+            f"{name}: no tick follows finish(), nothing would come of it; call it in step()"
+        )
 
 
 def _duration(kind: str, value: Any) -> float:

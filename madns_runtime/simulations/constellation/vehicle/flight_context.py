@@ -102,6 +102,7 @@ class VehicleContext:
         self.delta_v, self.torque, self.ballistic = desk.delta_v, desk.torque, desk.ballistic
         self.dipole = desk.dipole
         self._tick: int | None = None
+        self._is_over = False
         self._t_s = self._leaves_s = -math.inf
         self._messages = 0
         self._messages_in_tick = 0
@@ -125,6 +126,11 @@ class VehicleContext:
         self._leaves_s = t_s if leaves_s is None else leaves_s
         self._messages_in_tick = 0
 
+    def end(self) -> None:
+        """Take neither commands nor messages any more: no tick follows."""
+        self._is_over = True
+        self.desk.end()
+
     def begin_answer(self) -> None:
         """Take what a program says from here on as its answer to another tick, whose bounds are its own."""
         self.desk.begin_answer()
@@ -134,7 +140,7 @@ class VehicleContext:
 
     def send(self, to: str, payload: Any) -> int:
         """Send a message by radio."""
-        check_running("send", self._tick)
+        check_running("send", self._tick, is_over=self._is_over)
         if not isinstance(to, str):
             raise PluginError(f"send: expected a receiver's name, got {to!r:.80}")
         if self._messages_in_tick >= MESSAGES_PER_TICK_MAX:

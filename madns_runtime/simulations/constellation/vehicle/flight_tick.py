@@ -232,6 +232,7 @@ class Cockpit:
         Raises:
             BlamedError: Flight software raised, or returned what is no summary.
         """
+        self._board.end()
         summary = self._call("finish", getattr(self._software, "finish", dict))
         try:
             told = validation.summary(summary)

@@ -258,7 +258,8 @@ class UdpLink(Transport):
     def receive(self) -> bytes | None:
         """Return the datagrams that are there, together; those of others are counted."""
         found, self._first = self._first, []
-        while self._socket is not None and len(found) < DATAGRAMS_MAX:
+        size = sum(map(len, found))
+        while self._socket is not None and len(found) < DATAGRAMS_MAX and size < READ_BYTES:
             try:
                 data, sender = self._socket.recvfrom(READ_BYTES)
             except BlockingIOError:
@@ -267,6 +268,7 @@ class UdpLink(Transport):
                 break
             if sender == self._remote:
                 found.append(data)
+                size += len(data)
             else:
                 self.counts["packets_foreign"] += 1
                 if self.counts["packets_foreign"] % DATAGRAMS_MAX == 0:

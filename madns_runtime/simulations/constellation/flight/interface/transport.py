@@ -81,7 +81,11 @@ class Transport(ABC):
 
     @abstractmethod
     def receive(self) -> bytes | None:
-        """Return what has come, at most READ_BYTES of it; None for nothing yet, nothing for no more."""
+        """
+        Return what has come, at most READ_BYTES of it; None for nothing yet, nothing for no more.
+
+        Of datagrams, which come whole, the last may go beyond that.
+        """
 
     def push(self) -> None:  # noqa: B027 - most have nothing that waits
         """Go on with what could not be done at once."""
