@@ -133,7 +133,8 @@ class AgentRunner:
         )
         self._usage_timer = reactor.call_at(math.inf, self._record_usage)  # at no time, as yet
         self._outcome = AgentOutcome(as_ordered=False, reason="did not end")
-        self._is_closed, self._takes_data = False, True
+        self._is_closed = False
+        self._takes_data = True
 
     def _make_ticks(self, seat: LoopSeat, recorder: Recorder) -> PacedTicks:
         calls = TickCalls(
@@ -339,9 +340,8 @@ class AgentRunner:
         )
         self._takes_data = False
         self._cancel_timers()
-        if (
-            not self._faults.has_killed
-        ):  # then its process goes on for others, and it says no more than one that has its own
+        # Killed on purpose, it says no more than one that has a process of its own: this one goes on for others.
+        if not self._faults.has_killed:
             self._journal.emergency(reason)
         self._actions.leave_clock()
         self.half.abandon()

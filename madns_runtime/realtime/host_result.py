@@ -168,7 +168,7 @@ def _agent_result(
             sum(told.get("held_dropped", 0) for told in incarnations),
             ended_on_purpose=ended_on_purpose,
         )
-        | {"too_late": sum(told.get("too_late", 0) for told in lives)},
+        | {"too_late": sum(told.get("too_late", 0) for told in incarnations)},
         "records": records,
         "simulation": simulation,
     }
