@@ -1,6 +1,7 @@
 """The same guidance by every protocol and over every transport; and what becomes of software that is not as it should."""
 
 import json
+import math
 import os
 import re
 import shutil
@@ -281,6 +282,19 @@ def test_software_behind_a_device_that_takes_the_ends_of_lines_is_refused(tmp_pa
         device = FakeDevice(framing=framing)
         device.software.feed = lambda data: []
         Attached(tmp_path, None, flight=flight, hardware={"line": device}).agent.abandon()
+
+
+def test_times_of_answers_name_the_tick_that_does_the_step(tmp_path):
+    flight = attached({"kind": "device", "device": "line"}) | {"rate_hz": 5.0 * HZ}
+    devices = {"line": FakeDevice()}
+    with Attached(tmp_path, None, flight=flight, is_lockstep=False, hardware=devices) as ship:
+        ship.run(4)
+
+    told = ship.context.records["flight_answers"]
+    assert [(tick, round(t_s * HZ, 9)) for tick, t_s, _ in told] == [
+        (math.ceil(step / 5), step / 5) for step in range(len(told))
+    ]
+    assert len(told) > 10
 
 
 def test_of_a_flood_through_a_device_the_newest_bytes_are_taken(tmp_path):

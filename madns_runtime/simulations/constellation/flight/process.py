@@ -21,7 +21,7 @@ from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.simulations.constellation.flight.api import AnsweredContext, Readings
 from madns_runtime.simulations.constellation.flight.asked_ticks import AskedTick, AskedTicks
-from madns_runtime.simulations.constellation.flight.held_answers import held_answers
+from madns_runtime.simulations.constellation.flight.held_answers import held_answers, tick_of
 from madns_runtime.simulations.constellation.flight.interface.answers import (
     FlightAnswer,
     carry_out,
@@ -356,9 +356,9 @@ class ExternalFlight:
             self._record_answer(asked, came_s)
 
     def _record_answer(self, asked: AskedTick, came_s: float) -> None:
-        sent_s, asked_s = asked
-        tick, answer_us = round(asked_s * self._context.tick_hz), round((came_s - sent_s) * 1e6, 1)
-        self._agent.record("flight_answers", (tick, asked_s, answer_us))
+        tick = tick_of(asked.t_s, self._context.tick_hz)
+        row = (tick, asked.t_s, round((came_s - asked.sent_s) * 1e6, 1))
+        self._agent.record("flight_answers", row)
 
     def _record_clock(self, t_s: float) -> None:
         if t_s - self._clock_s < CLOCK_S:
