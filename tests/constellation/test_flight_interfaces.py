@@ -297,6 +297,20 @@ def test_times_of_answers_name_the_tick_that_does_the_step(tmp_path):
     assert len(told) > 10
 
 
+def test_what_software_that_fell_silent_was_not_told_is_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(ExternalFlight, "last_answers_s", 0.0)
+    device, flight = FakeDevice(), attached({"kind": "device", "device": "line"})
+    device.software.feed = lambda data: []
+    with Attached(
+        tmp_path, None, flight=flight, is_lockstep=False, hardware={"line": device}
+    ) as ship:
+        ship.run(UNANSWERED_MAX)
+        ship.agent._cockpit._software.receive(None)
+        ship.run(1)
+
+    assert (ship.summary["ticks_skipped"], ship.summary["mail_unsent"]) == (1, 1)
+
+
 def test_of_a_flood_through_a_device_the_newest_bytes_are_taken(tmp_path):
     device = FakeDevice()
     flight = attached({"kind": "device", "device": "line"})

@@ -200,17 +200,17 @@ class ExternalFlight:
 
     def finish(self) -> Mapping[str, Any]:
         """End the program, and return what came of it; in real time what was late is judged."""
+        counts = self._counts
         if not self._is_lockstep:
             self._await_last()
-        overdue = self._asked.count_overdue(self._listened_s)
-        if not self._counts["answers"]:  # nobody knows whether it works at all
-            overdue = len(self._asked)
+        # Of one that has answered nothing nobody knows whether it works at all: all is overdue.
+        overdue = self._asked.count_overdue(self._listened_s if counts["answers"] else math.inf)
         code = self._link.end()
         self._keep_talk()
         if code:
             told = f"{self._link.name} ended with exit code {code}{self._last_words()}"
             self._context.log("warning", told)
-        counts, summary = self._counts, dict[str, Any](self._counts)
+        summary: dict[str, Any] = {**counts, "mail_unsent": sum(map(len, self._mail.values()))}
         if self._link.program is not None:
             lines, size_bytes = self._link.program.talk_counts
             summary |= {"stderr_lines": lines, "stderr_bytes": size_bytes, "exit_code": code}
