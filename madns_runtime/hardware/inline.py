@@ -173,6 +173,12 @@ class InlineDevice:
             self._failure = error
             self._note_error(str(error))
 
+    def owner_gone(self) -> None:
+        """Make it safe: the agent that moves it has ended, and what that last said is not carried out."""
+        self._hear()
+        self._intake.count("writes_lost", self._outputs.clear())
+        self._make_safe(max(self._now_s(), 0.0))
+
     def insert_fault(self, action: str, value: float | None, t_s: float) -> None:
         """
         Put a fault in force, or clear all, at simulated time *t_s*, s: the samples before it are as they were.

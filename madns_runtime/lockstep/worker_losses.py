@@ -19,10 +19,11 @@ class WorkerLosses:
         return bool(self._untold)
 
     def add(self, agent: LockstepAgent, reason: str) -> None:
-        """Close an agent's records, and keep word of its loss; its devices outlive it."""
+        """Close an agent's records, and keep word of its loss; its devices, made safe, outlive it."""
         agent.journal.event("emergency", reason=reason)
         agent.journal.say("critical", f"emergency shutdown: {reason}")
         self._devices[agent.index] = agent.devices
+        agent.devices.owner_gone()
         losses = agent.journal.device_losses(agent.devices.hardware.losses())
         self._untold[agent.index] = Loss(
             agent.index,
