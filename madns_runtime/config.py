@@ -214,9 +214,9 @@ class ScenarioDevice:
     """Rate at which it is read, Hz; the kind's own if not given."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """The kind's own."""
-    hang_s: Annotated[float, Gt(0), Le(3600)] = 15.0
+    hang_s: Annotated[float, Ge(0.1), Le(3600)] = 15.0
     """A device that says nothing for so long is given up: its process is killed and started anew."""
-    frozen_s: Mapping[str, float] = field(default_factory=dict)
+    frozen_s: Mapping[str, Annotated[float, Gt(0)]] = field(default_factory=dict)
     """By input: values unchanged for so many seconds are frozen."""
 
 

@@ -48,6 +48,8 @@ class Channel:
     """in: the device measures it; out: the device takes it."""
     is_frame: bool = False
     """Whether its values are bytes, of at most `frame_bytes_max`."""
+    is_line: bool = False
+    """Of frames: whether each is a line without its end, so that not all bytes can be in one, and none tells where it ends."""
     frame_bytes_max: int = 1024
     passing: Literal["newest", "queue"] = "newest"
     """newest: who is late finds the newest value alone; queue: each value arrives once, in order."""

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from madns_runtime.config import DeviceLaunch
-from madns_runtime.errors import BlamedError, PluginError
+from madns_runtime.errors import BlamedError, MadnsError, PluginError
 from madns_runtime.hardware import messages, page
-from madns_runtime.hardware.contract import SimulatedDevice
+from madns_runtime.hardware.contract import Device, SimulatedDevice
 from madns_runtime.hardware.driver_answers import identity_of
 from madns_runtime.hardware.fault_actions import DISCONNECTED
 from madns_runtime.hardware.intake import Intake, silent_inputs
@@ -40,7 +40,7 @@ class InlineDevice:
         now_s: Returns the simulated time, s.
 
     Raises:
-        PluginError: Its kind does not follow simulated time.
+        PluginError: Its kind does not follow simulated time, or its driver raised as it was made.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class InlineDevice:
         *,
         now_s: Callable[[], float],
     ) -> None:
-        device = program.make()
+        device = _made(launch, program)
         if not isinstance(device, SimulatedDevice):
             raise PluginError(
                 f"{launch.full_name}: a {program.kind.name} does not follow simulated time"
@@ -172,6 +172,12 @@ class InlineDevice:
         except PluginError as error:
             self._failure = error
             self._note_error(str(error))
+
+    def owner_gone(self) -> None:
+        """Make it safe: the agent that moves it has ended, and what that last said is not carried out."""
+        self._hear()
+        self._intake.count("writes_lost", self._outputs.clear())
+        self._make_safe(max(self._now_s(), 0.0))
 
     def insert_fault(self, action: str, value: float | None, t_s: float) -> None:
         """
@@ -303,3 +309,20 @@ class InlineDevice:
             return 0
         self.port.collect()  # nobody else makes room before the tick; what is too much is counted there
         return int(not messages.send(self._own_end, message))
+
+
+def _made(launch: DeviceLaunch, program: DeviceProgram) -> Device:
+    """
+    Return the driver.
+
+    Raises:
+        BlamedError: It raised; the text says where.
+        MadnsError: There is none, or a library that it needs is not installed.
+    """
+    try:
+        return program.make()
+    except MadnsError:
+        raise
+    except (Exception, SystemExit) as error:
+        text = describe_exception(error, f"{launch.kind}.__init__")
+        raise BlamedError(f"device {launch.name}: {text}") from error

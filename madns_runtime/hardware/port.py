@@ -120,7 +120,9 @@ class DevicePort:
         declared = self.channels.get(channel)
         if declared is None:
             raise PluginError(f"{self.name} has no channel {channel!r}{self._known()}")
-        return ChannelForm(declared.unit, 0 if declared.is_frame else declared.size)
+        return ChannelForm(
+            declared.unit, 0 if declared.is_frame else declared.size, declared.is_line
+        )
 
     def frames(self, channel: str) -> list[ChannelFrame]:
         """Return all that has come through a queue since the last call; see `DeviceView`."""

@@ -107,7 +107,7 @@ class DeviceRunner:
                 intake, readable = self._intake, self._readable
                 self._descriptor = DriverDescriptor(fd, self._reactor, readable, intake.event)
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
-            self._fail("open", error)
+            self._fail("open" if self._device is not None else "__init__", error)
             return
         header[page.OPENED_S] = header[page.ACTIVE_S] = now_s = monotonic()
         header[page.STATE] = page.OPEN
@@ -154,7 +154,8 @@ class DeviceRunner:
     def _close_device(self) -> None:
         """Make the device safe and close it; what either raises is recorded."""
         device, self._device = self._device, None
-        if device is None:
+        if device is None:  # it could not even be made, or is closed already
+            self._header[page.STATE] = page.CLOSED
             return
         self._read_timer.reschedule(math.inf)
         if self._descriptor is not None:

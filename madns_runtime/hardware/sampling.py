@@ -20,7 +20,8 @@ from typing import Annotated, Any, Final
 from annotated_types import Gt, Le
 
 from madns_runtime.config import AgentLaunch, Agents, DeviceLaunch, RunConfig
-from madns_runtime.errors import MadnsError, PluginError
+from madns_runtime.errors import ConfigurationError, MadnsError, PluginError
+from madns_runtime.hardware.bounds import bound_faults
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.manager import DeviceManager
 from madns_runtime.hardware.port import Hardware
@@ -59,12 +60,25 @@ def main() -> None:
     told: Mapping[str, Any]
     try:
         line = sys.stdin.buffer.readline(ORDER_BYTES_MAX)
-        told = {"devices": sample(from_mapping(SamplingOrder, json.loads(line)))}
+        told = {"devices": sample(order_of(json.loads(line)))}
     except MadnsError as error:
         told = {"error": str(error)}
     with open(answer_fd, "w", encoding="utf-8") as file:
         json.dump(told, file)
         file.write("\n")
+
+
+def order_of(given: Any) -> SamplingOrder:
+    """
+    Return an order.
+
+    Raises:
+        ConfigurationError: It is none, or beyond its bounds.
+    """
+    order = from_mapping(SamplingOrder, given)
+    if beyond := bound_faults(order, SamplingOrder.__name__):
+        raise ConfigurationError("; ".join(beyond))
+    return order
 
 
 def sample(order: SamplingOrder) -> dict[str, Any]:

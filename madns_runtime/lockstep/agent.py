@@ -262,6 +262,11 @@ class AgentDevices:
         for device in self._devices:
             device.follow(t_s)
 
+    def owner_gone(self) -> None:
+        """Make all safe: the agent has ended."""
+        for device in self._devices:
+            device.owner_gone()
+
     def take_fault(self, order: ActionOrder) -> None:
         """
         Insert a fault around a device, or clear all of it, at the time of the order.

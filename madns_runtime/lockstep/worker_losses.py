@@ -19,12 +19,12 @@ class WorkerLosses:
         return bool(self._untold)
 
     def add(self, agent: LockstepAgent, reason: str) -> None:
-        """Close an agent's records, and keep word of its loss; its devices outlive it."""
-        if (
-            not agent.is_killed
-        ):  # as of a process that a fault ends: it says that it is killed, and no more
+        """Close an agent's records, and keep word of its loss; its devices, made safe, outlive it."""
+        # As of a process that a fault ends: it says that it is killed, and no more.
+        if not agent.is_killed:
             agent.journal.emergency(reason)
         self._devices[agent.index] = agent.devices
+        agent.devices.owner_gone()
         losses = agent.journal.device_losses(agent.devices.hardware.losses())
         self._untold[agent.index] = Loss(
             agent.index,

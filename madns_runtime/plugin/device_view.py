@@ -42,6 +42,8 @@ class ChannelForm(NamedTuple):
     """As its kind declares it, such as rad/s; empty if it does not."""
     size: int
     """Numbers of a value; 0 of a channel of frames."""
+    is_line: bool = False
+    """Of frames: whether each is a line without its end, so that not all bytes can be in one."""
 
 
 class DeviceView(Protocol):

@@ -1,6 +1,7 @@
 """The same guidance by every protocol and over every transport; and what becomes of software that is not as it should."""
 
 import json
+import math
 import os
 import re
 import shutil
@@ -20,8 +21,9 @@ from harness.waiting import wait_until
 from test_flight_process import HZ, PATIENCE_S, Ship, patience  # noqa: F401 - a fixture
 
 from madns_runtime.errors import BlamedError
+from madns_runtime.hardware.kind_registry import prepare
 from madns_runtime.plugin import isolation
-from madns_runtime.plugin.device_view import ChannelFrame
+from madns_runtime.plugin.device_view import ChannelForm, ChannelFrame
 from madns_runtime.simulations.constellation.flight.asked_ticks import UNANSWERED_MAX
 from madns_runtime.simulations.constellation.flight.interface.program import FlightProgram
 from madns_runtime.simulations.constellation.flight.interface.socket_transports import (
@@ -235,7 +237,9 @@ class FakeDevice:
 
     name = "line"
 
-    def __init__(self):
+    def __init__(self, **settings):
+        program = prepare("serial", {"port": "/dev/ttyUSB0", "framing": "raw", **settings}, HERE)
+        self.channels = {channel.name: channel for channel in program.channels}
         guidance = guided_program.Guidance()
         guidance.settings = dict(SETTINGS)
         self.software = guided_program.Frames(guidance)
@@ -244,6 +248,9 @@ class FakeDevice:
     def write(self, channel, value, *, due_s=None):
         assert channel == "sent"
         self.waiting += self.software.feed(value)
+
+    def form_of(self, channel):
+        return ChannelForm("", 0, self.channels[channel].is_line)
 
     def frames(self, channel):
         assert channel == "received"
@@ -263,6 +270,47 @@ def test_software_behind_a_device_of_the_run(tmp_path, is_lockstep):
     assert len(ship.context.records["flight_answers"]) == 10 * (not is_lockstep)
     with pytest.raises(BlamedError, match="this agent's hardware, other; got 'line'"):
         Attached(tmp_path, None, flight=flight, hardware={"other": FakeDevice()})
+
+
+@pytest.mark.parametrize("protocol", ["json_lines", "frames", "space_packets"])
+def test_software_behind_a_device_that_takes_the_ends_of_lines_is_refused(tmp_path, protocol):
+    flight = attached({"kind": "device", "device": "line"}, protocol)
+    told = f"device line: expected bytes as they come, among which {protocol} finds .*framing: raw"
+    for framing in ("lines", "nmea"):
+        with pytest.raises(BlamedError, match=told):
+            Attached(tmp_path, None, flight=flight, hardware={"line": FakeDevice(framing=framing)})
+    # In frames of any bytes packets may be.
+    for framing in ("cobs", "length_prefixed"):
+        device = FakeDevice(framing=framing)
+        device.software.feed = lambda data: []
+        Attached(tmp_path, None, flight=flight, hardware={"line": device}).agent.abandon()
+
+
+def test_times_of_answers_name_the_tick_that_does_the_step(tmp_path):
+    flight = attached({"kind": "device", "device": "line"}) | {"rate_hz": 5.0 * HZ}
+    devices = {"line": FakeDevice()}
+    with Attached(tmp_path, None, flight=flight, is_lockstep=False, hardware=devices) as ship:
+        ship.run(4)
+
+    told = ship.context.records["flight_answers"]
+    assert [(tick, round(t_s * HZ, 9)) for tick, t_s, _ in told] == [
+        (math.ceil(step / 5), step / 5) for step in range(len(told))
+    ]
+    assert len(told) > 10
+
+
+def test_what_software_that_fell_silent_was_not_told_is_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(ExternalFlight, "last_answers_s", 0.0)
+    device, flight = FakeDevice(), attached({"kind": "device", "device": "line"})
+    device.software.feed = lambda data: []
+    with Attached(
+        tmp_path, None, flight=flight, is_lockstep=False, hardware={"line": device}
+    ) as ship:
+        ship.run(UNANSWERED_MAX)
+        ship.agent._cockpit._software.receive(None)
+        ship.run(1)
+
+    assert (ship.summary["ticks_skipped"], ship.summary["mail_unsent"]) == (1, 1)
 
 
 def test_of_a_flood_through_a_device_the_newest_bytes_are_taken(tmp_path):

@@ -210,6 +210,27 @@ def test_a_driver_that_raises_is_told_by_name_and_tried_again(tmp_path, method):
     assert result["restarts"] == 0  # its process lives
 
 
+def test_a_driver_that_fails_while_it_is_made_is_lost_as_one_that_does_not_open(tmp_path):
+    made = "\n    def __init__(self, parameters):\n        raise OSError('no such bus')\n"
+    (tmp_path / "made.py").write_text(bench_module.DRIVER + "\n\nclass Made(Line):" + made)
+    launch = DeviceLaunch(
+        name="made", place="pi22", kind="./made.py:Made", base_directory=str(tmp_path),
+        rate_hz=50.0, parameters={"port": ""}, users=(AGENT,),
+    )  # fmt: skip
+    bench = DeviceBench(tmp_path / "run", (launch,), lost_s=None)
+    bench.start_time()
+    bench.until(lambda: "lost" in bench.statuses("made"))
+    [driven] = bench.manager._devices.values()
+    state = driven.seat.page.header[page.STATE]
+    result = bench.close()["pi22/made"]
+
+    told = "./made.py:Made.__init__ raised OSError: no such bus (made.py:"
+    [lost] = [event for event in bench.events if event.get("status") == "lost"]
+    assert lost["why"].startswith(told)
+    assert result["why"].startswith(told)
+    assert state == page.CLOSED
+
+
 def test_a_device_that_takes_its_time_to_close_is_lost_for_what_its_driver_raised(tmp_path):
     gone = tmp_path / "gone"
     with line_bench(tmp_path, rate_hz=5.0, gone_file=str(gone), close_s=0.4) as (bench, _):

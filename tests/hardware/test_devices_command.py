@@ -16,6 +16,8 @@ from harness.waiting import is_alive, wait_until
 
 from cosmos_cli.app import run as cosmos
 from hardware.bench import DRIVER, Terminal
+from madns_runtime.errors import ConfigurationError
+from madns_runtime.hardware import sampling
 from madns_runtime.hardware.kind_registry import prepare, registered_kinds
 
 pytestmark = pytest.mark.process
@@ -244,3 +246,8 @@ def test_what_a_device_needs_and_is_missing_is_told_with_its_cure(
     told = capsys.readouterr().err
     assert "pi22/hat: no file /dev/no-such-hat*: write dtparam=hat=on into config.txt" in told
     assert "no Python module no_such_hat: sudo apt-get install hat-tools" in told
+
+
+def test_an_order_to_drive_devices_for_longer_than_an_hour_is_refused():
+    with pytest.raises(ConfigurationError, match=r"SamplingOrder\.seconds: expected at most 3600"):
+        sampling.order_of({"devices": [], "seconds": 4000.0, "directory": "."})

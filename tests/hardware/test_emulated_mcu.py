@@ -115,6 +115,21 @@ def test_what_a_flood_brings_beyond_the_lines_rate_is_lost_and_counted(image):
     assert taken + lost <= 320_000 + 100  # and the one line that answers
 
 
+def test_what_is_on_its_way_at_its_end_is_counted(image):
+    counts = Counter()
+    with opened("emulated_mcu", firmware=image, gather_s=1.0) as mcu:
+        mcu.count = lambda name, number: counts.update({name: number})
+        mcu.write({"sent": b"?"}, time.monotonic())
+        wait_until(lambda: [mcu.read(), mcu._gathered.endswith(b"\n")][1])
+        os.kill(mcu._process.pid, signal.SIGSTOP)
+        for _ in range(200):
+            mcu.write({"sent": b"x" * 2048}, time.monotonic())
+        wanted = {"bytes_left": len(mcu._gathered), "bytes_unsent": len(mcu._unsent)}
+
+    assert min(wanted.values()) > 0
+    assert {name: counts[name] for name in wanted} == wanted
+
+
 def test_killed_emulator_is_named(image):
     with opened("emulated_mcu", firmware=image) as mcu:
         os.kill(mcu._process.pid, signal.SIGKILL)

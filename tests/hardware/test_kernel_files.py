@@ -8,7 +8,7 @@ import shutil
 
 import pytest
 
-from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.errors import ConfigurationError, MachineError, PluginError
 from madns_runtime.hardware.drivers import pwm
 from madns_runtime.hardware.kind_registry import prepare
 from tests.hardware.driving import opened
@@ -166,6 +166,13 @@ def test_a_pwm_line_is_asked_for_and_one_that_never_comes_is_told(chip):
         opened("pwm", root=str(chip.parent)),
     ):
         pass
+
+
+def test_a_pwm_period_of_no_whole_nanosecond_is_refused():
+    with pytest.raises(
+        ConfigurationError, match=r"pwm\.parameters\.period_s: expected at least 1e-09"
+    ):
+        prepare("pwm", {"period_s": 4e-10}, None)
 
 
 def test_a_safe_duty_beyond_the_limits_is_refused(chip):

@@ -213,6 +213,33 @@ checks:
 """
 
 
+def test_the_owners_end_makes_a_device_safe_in_lockstep_too(tmp_path):
+    killed = MOVED[: MOVED.index("timeline:")] + (
+        "on_agent_loss: continue\nagents: {count: 2, tick_hz: 10}\n"
+        'timeline:\n  - {at_s: 3, action: kill, agents: ["agent-01"], for_s: 1}\n'
+    )
+    killed = killed.replace("agents: {count: 1, tick_hz: 10}\n", "", 1)
+    valve = VALVE.replace('self.count("lost_bytes", 2)', "pass")
+    for name, text in (("valve.py", valve), ("mover.py", MOVER), ("moved.yaml", killed)):
+        (tmp_path / name).write_text(text)
+    cosmos = CosmosCommand(tmp_path)
+
+    _, run = cosmos.run(tmp_path / "moved.yaml", *LOOSE)
+
+    folder = cosmos.directory(run) / "devices"
+    safe_s = {
+        agent: [
+            round(each["t_s"])
+            for each in rows(folder / agent / "valve/events.jsonl")
+            if each["event"] == "made_safe"
+        ]
+        for agent in ("agent-01", "agent-02")
+    }
+    assert safe_s == {"agent-01": [3, 6], "agent-02": [6]}
+    lost = [run["devices"][f"{agent}/valve"]["counts"].get("writes_lost", 0) for agent in safe_s]
+    assert lost == [1, 0]  # what it said in its last tick
+
+
 def test_a_fault_that_ends_while_its_agent_is_away_is_over_when_that_returns(tmp_path):
     (tmp_path / "past.yaml").write_text(SCENARIO + PAST)
     cosmos = CosmosCommand(tmp_path)
@@ -310,7 +337,7 @@ class Failing(Valve):
 """
 
 
-@pytest.mark.parametrize("method", ["open", "sample_at", "write", "make_safe", "close"])
+@pytest.mark.parametrize("method", ["__init__", "open", "sample_at", "write", "make_safe", "close"])
 def test_what_a_driver_raises_in_lockstep_is_told_by_its_own_line(tmp_path, method):
     text = VALVE.replace('        self.count("lost_bytes", 2)\n', "")
     (tmp_path / "valve.py").write_text(text + FAILING.replace("METHOD", method))
@@ -321,9 +348,10 @@ def test_what_a_driver_raises_in_lockstep_is_told_by_its_own_line(tmp_path, meth
     code, run = CosmosCommand(tmp_path).run(tmp_path / "moved.yaml", *LOOSE)
 
     line = len((text + FAILING).splitlines())
-    told = f"device valve: Failing.{method} raised ValueError: stuck (valve.py:{line})"
-    device = run["devices"]["agent-01/valve"]
+    kind = "./valve.py:" if method == "__init__" else ""  # of which there is no driver yet
+    told = f"device valve: {kind}Failing.{method} raised ValueError: stuck (valve.py:{line})"
     if method in ("make_safe", "close"):  # the run is over, and its account is given all the same
+        device = run["devices"]["agent-01/valve"]
         assert (device["why"], device["errors"], device["samples"]) == (told, 1, 10)
         assert device["unsafe"] == (method == "make_safe")
         assert ("hardware.unsafe" in run["verdict"]) == (method == "make_safe")

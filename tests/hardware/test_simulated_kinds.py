@@ -54,6 +54,17 @@ def test_noise_is_the_seeds():
     assert first.std(axis=0) == pytest.approx([0.1] * 3, rel=0.1)
 
 
+def test_each_agents_own_device_has_noise_of_its_own():
+    def first(place: str) -> list[float]:
+        device = prepare("synthetic", {"channels": CHANNELS, "seed": 1}, None).make()
+        device.place = place
+        device.open()
+        return device.sample_at(0.0).values["gyro"]
+
+    assert first("agent-01") == first("agent-01")
+    assert first("agent-01") != first("agent-02")
+
+
 def test_null_takes_anything_and_tells_the_time():
     with opened("null", outputs=["valve"], low=-1.0, high=1.0) as device:
         device.write({"valve": 1.0}, 0.0)

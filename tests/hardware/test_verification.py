@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 from harness.firmware import build_firmware, needs_emulator
 
+from madns_runtime.config import DeviceLaunch
+from madns_runtime.hardware.claims import DeviceClaims
+from madns_runtime.hardware.contract import DeviceKind
 from madns_runtime.hardware.kind_registry import registered_kinds
 from madns_runtime.hardware.verification.order import STEPS
 from tests.hardware.bench import is_late
@@ -282,6 +285,27 @@ def test_a_file_without_a_name_has_one_class(tmp_path, classes, told):
     (tmp_path / "many.py").write_text(head + "".join(body.format(name) for name in classes))
     [declaration] = verify(tmp_path, "./many.py").values()
     assert told in declaration["got"]
+
+
+def test_a_part_of_the_machine_that_a_run_has_is_left_alone(tmp_path, monkeypatch):
+    monkeypatch.setenv("COSMOS_STATE_DIR", str(tmp_path / "state"))
+    text = DRIVER.replace("needs_hardware=False", "needs=Needs(exclusive=('door 4',))")
+    text = text.replace("import Channel", "import Channel, Needs").replace("FAULT_READ", "pass")
+    text = text.replace("FAULT_OPEN", "open(__file__ + '.opened', 'w').close()").replace(
+        "FAULT_WRITE", "pass"
+    )
+    (tmp_path / "line.py").write_text(text)
+    launch = DeviceLaunch(name="door", place="pi22", kind="gate", base_directory="", rate_hz=1.0)
+    claims = DeviceClaims("0007-hwil")
+    claims.claim(launch, DeviceKind(name="gate", summary="", channels=()), ("door 4",))
+
+    findings = verify(
+        tmp_path, "./line.py", may_write=True, steps=("opening", "samples", "outputs")
+    )
+
+    claims.release()
+    assert "door 4 is in use by run 0007-hwil" in failed(findings)["opening"]
+    assert not (tmp_path / "line.py.opened").exists()
 
 
 def test_a_kind_that_does_not_load_is_one_finding(tmp_path):

@@ -55,6 +55,7 @@ class EmulatedMcu(Device):
     """Sensors that are frozen hold what they held: the firmware reads it again and again."""
     _process: subprocess.Popen[bytes] | None = None
     _lost_bytes = 0
+    _gathered = _unsent = b""
 
     def open(self) -> str:
         """
@@ -155,7 +156,10 @@ class EmulatedMcu(Device):
         return {"lost_bytes": self._lost_bytes}
 
     def close(self) -> None:
-        """End the emulator."""
+        """End the emulator; bytes of its line that are on their way, either way, are counted."""
+        self.count("bytes_left", len(self._gathered))
+        self.count("bytes_unsent", len(self._unsent))
+        self._gathered = self._unsent = b""
         process, self._process = self._process, None
         if process is not None:
             process.kill()

@@ -27,11 +27,12 @@ SHAPES: Final[dict[str, Callable[[float], float]]] = {
 
 
 class SyntheticDevice(SimulatedDevice):
-    """Computes its samples; the noise of one depends on the seed and on how many were before."""
+    """Computes its samples; the noise of one depends on the seed, on whose device it is and on how many were before."""
 
     def open(self) -> str:
         """Begin the noise anew."""
-        self._random = np.random.default_rng(self.parameters.seed)
+        # Without its place, the devices that a scenario gives its agents would all err alike.
+        self._random = np.random.default_rng([self.parameters.seed, *self.place.encode()])
         return "synthetic"
 
     def sample_at(self, t_s: float) -> Sample | None:

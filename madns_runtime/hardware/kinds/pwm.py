@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
 from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 
@@ -19,8 +19,8 @@ class PwmParameters:
 
     chip: Annotated[int, Ge(0), Le(255)] = 0
     line: Annotated[int, Ge(0), Le(255)] = 0
-    period_s: Annotated[float, Gt(0), Le(10)] = 0.02
-    """0.02 s is what servos want."""
+    period_s: Annotated[float, Ge(1e-9), Le(10)] = 0.02
+    """0.02 s is what servos want; the kernel counts it in whole nanoseconds."""
     low: Annotated[float, Ge(0), Le(1)] = 0.0
     high: Annotated[float, Ge(0), Le(1)] = 1.0
     """Limits of the share of the period in which the line is on."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Ge, Le, MinLen
 
@@ -11,6 +11,9 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 from madns_runtime.hardware.framing import Framing, make_framer
 from madns_runtime.hardware.values import from_hex
+
+LINES: Final[tuple[Framing, ...]] = ("lines", "nmea")
+"""Framings whose frames are lines without their ends."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +67,7 @@ def channels_of(parameters: SerialParameters) -> tuple[Channel, ...]:
         "is_frame": True,
         "frame_bytes_max": frame_bytes_max,
         "passing": "queue",
+        "is_line": p.framing in LINES,
     }
     return (
         Channel(name="received", **shared),

@@ -49,7 +49,7 @@ class SyntheticParameters:
         )
     )
     seed: Annotated[int, Ge(0)] = 0
-    """Of the noise."""
+    """Of the noise; each agent's own device, and each machine's, has another one under it."""
 
 
 def channels_of(parameters: SyntheticParameters) -> tuple[Channel, ...]:

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 from madns_runtime.errors import MadnsError
@@ -28,7 +29,7 @@ from madns_runtime.hardware.verification.order import (
     make_program,
     spec_of,
 )
-from madns_runtime.hardware.verification.process import lose_device
+from madns_runtime.hardware.verification.process import claimed, lose_device
 from madns_runtime.hardware.verification.steps import run_step
 from madns_runtime.plain_values import from_mapping
 
@@ -48,19 +49,23 @@ def verify_device(order: VerificationOrder) -> Findings:
         units_of(program),
     ]
     with line_of(order, program, rate_hz) as line_program:
-        runs: dict[str, Callable[[], Findings]] = {
+        driven: dict[str, Callable[[], Findings]] = {
             "opening": lambda: open_often(line_program, order.cycles),
             "samples": lambda: take_samples(
                 line_program, rate_hz, order.sampling_s, is_asked=is_asked
             ),
             "outputs": lambda: move_outputs(line_program),
+        }
+        runs: dict[str, Callable[[], Findings]] = {
+            **{name: partial(claimed, order, line_program, run) for name, run in driven.items()},
+            # Which claims it as a run does.
             "process": lambda: lose_device(order, line_program, rate_hz, may_write),
         }
-        for name, run in runs.items():
+        for name, step in runs.items():
             if name not in order.steps:
                 continue
             why = _why_not(name, program, findings, may_write=may_write)
-            findings += [finding(name, None, why)] if why else run_step(name, run)
+            findings += [finding(name, None, why)] if why else run_step(name, step)
             if findings[-1].name == "opening" and not findings[-1].passed:
                 return findings  # the reason stands there once
     if "line" in order.steps and has_stand_in(order):

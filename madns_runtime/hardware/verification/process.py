@@ -1,4 +1,4 @@
-"""A device's process as a run drives it: killed, hung, ended."""
+"""A device as a run has it: for itself alone, in a process that is killed, hung, ended."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from madns_runtime.config import AgentLaunch, Agents, DeviceLaunch, RunConfig
 from madns_runtime.hardware import page
+from madns_runtime.hardware.claims import DeviceClaims
 from madns_runtime.hardware.contract import Device
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.manager import DeviceManager
@@ -32,31 +33,51 @@ HEALTH_S: Final = 1.0
 """Until a device that gives nothing is asked anything, which is its health."""
 BLOCKED_S: Final = 600.0
 HANG_S: Final = 1.0
-PLACE, NAME, OWNER = "here", "device", "agent-01"
+RUN, PLACE, NAME, OWNER = "0001-verify", "here", "device", "agent-01"
+
+
+def claimed(
+    order: VerificationOrder, program: DeviceProgram, run: Callable[[], Findings]
+) -> Findings:
+    """
+    Return the findings of a step that drives a device itself, for whose length no run has it; in a process of its own.
+
+    Raises:
+        MachineError: A run has it, or a part of the machine that it needs for itself alone.
+    """
+    claims = DeviceClaims(RUN)  # they end with the process, whatever the driver has started
+    claims.claim(_launch_of(order, program, 1.0, False), program.kind, program.needs.exclusive)
+    return run()
 
 
 def lose_device(
     order: VerificationOrder, program: DeviceProgram, rate_hz: float, may_write: bool
 ) -> Findings:
     """Kill, stop and block the device's process as a run drives it, and look how it comes back."""
-    parameters = dict(order.parameters)
-    if has_stand_in(order):
-        parameters[PORT] = program.parameters.port
     with tempfile.TemporaryDirectory(prefix="cosmos-verify-") as folder:
         config = RunConfig(
-            run="0001-verify", scenario="verify", simulation="verify",
+            run=RUN, scenario="verify", simulation="verify",
             base_directory=order.directory, agents=Agents(count=1),
         )  # fmt: skip
-        device = DeviceLaunch(
-            name=NAME, place=PLACE, kind=order.kind, base_directory=order.directory,
-            rate_hz=rate_hz, parameters=parameters, users=(OWNER,), owner=OWNER,
-            may_move=may_write, hang_s=HANG_S,
-        )  # fmt: skip
+        device = _launch_of(order, program, rate_hz, may_write)
         launch = AgentLaunch(
             config=config, run_key_hex="0" * 64, session_hex="0" * 16, machine=PLACE,
             agents=(OWNER,), host_address="", host_port=0, directory=folder, devices=(device,),
         )  # fmt: skip
         return _DrivenDevice(launch, may_write, 10.0 / rate_hz).run()
+
+
+def _launch_of(
+    order: VerificationOrder, program: DeviceProgram, rate_hz: float, may_write: bool
+) -> DeviceLaunch:
+    parameters = dict(order.parameters)
+    if has_stand_in(order):
+        parameters[PORT] = program.parameters.port
+    return DeviceLaunch(
+        name=NAME, place=PLACE, kind=order.kind, base_directory=order.directory,
+        rate_hz=rate_hz, parameters=parameters, users=(OWNER,), owner=OWNER,
+        may_move=may_write, hang_s=HANG_S,
+    )  # fmt: skip
 
 
 class _DrivenDevice:

@@ -84,6 +84,8 @@ def faults_of(folder: Path, hardware: str, *overrides: str) -> list[tuple[int | 
         ("{name: a, kind: synthetic, parameters: {seed: -4}}", "seed: expected >= 0, got -4"),
         ("{name: a, kind: synthetic, parameters: {sead: 4}}", "unknown key, did you mean seed?"),
         ("{name: a, kind: synthetic, frozen_s: {valu: 1}}", "did you mean value?"),
+        ("{name: a, kind: synthetic, frozen_s: {value: 0}}", "value: expected > 0, got 0"),
+        ("{name: a, kind: synthetic, hang_s: 0.001}", "hang_s: expected >= 0.1, got 0.001"),
         ("{name: a, kind: synthetic, rate_hz: 5000}", "rate_hz: expected <= 1000"),
         ("{name: a, kind: synthetic, agents: [chief]}", "agents[0]: no agent is named chief"),
         ("{name: a, kind: ./driver.py:Valve, parameters: {gain: 3}}", "gain: expected <= 2, got 3"),

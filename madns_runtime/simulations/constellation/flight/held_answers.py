@@ -19,6 +19,11 @@ TICK_TOLERANCE = 1e-6
 """Rounding of times, in ticks."""
 
 
+def tick_of(t_s: float, tick_hz: float) -> int:
+    """Return the tick in which a step is taken: several have one where flight software is faster than its vehicle."""
+    return math.ceil(t_s * tick_hz - TICK_TOLERANCE)
+
+
 def held_answers(agent: AgentContext) -> HeldAnswers | None:
     """Return what holds the answers of an agent's program in a rerun of real time; None where they are carried out as they come."""
     folder = agent.parameters.recorded_agents
@@ -47,17 +52,13 @@ class HeldAnswers:
 
     def hold(self, answer: FlightAnswer, asked_s: float) -> None:
         """Take the answer to the step at simulated time *asked_s*, s."""
-        due = self._tick_of(asked_s) + self._late.get(asked_s, 1)
+        due = tick_of(asked_s, self._tick_hz) + self._late.get(asked_s, 1)
         # One behind another is never carried out before it.
         self._held.append((max(due, self._held[-1][0] if self._held else due), answer, asked_s))
 
     def take(self, t_s: float) -> list[tuple[FlightAnswer, float]]:
         """Return what is due by the step at *t_s*, s, each answer with the time of the step that it answers."""
-        tick, found = self._tick_of(t_s), []
+        tick, found = tick_of(t_s, self._tick_hz), []
         while self._held and self._held[0][0] <= tick:
             found.append(self._held.popleft()[1:])
         return found
-
-    def _tick_of(self, t_s: float) -> int:
-        """Return the tick in which a step is taken: several have one where flight software is faster than its vehicle."""
-        return math.ceil(t_s * self._tick_hz - TICK_TOLERANCE)

@@ -21,7 +21,7 @@ from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.simulations.constellation.flight.api import AnsweredContext, Readings
 from madns_runtime.simulations.constellation.flight.asked_ticks import AskedTick, AskedTicks
-from madns_runtime.simulations.constellation.flight.held_answers import held_answers
+from madns_runtime.simulations.constellation.flight.held_answers import held_answers, tick_of
 from madns_runtime.simulations.constellation.flight.interface.answers import (
     FlightAnswer,
     carry_out,
@@ -200,17 +200,17 @@ class ExternalFlight:
 
     def finish(self) -> Mapping[str, Any]:
         """End the program, and return what came of it; in real time what was late is judged."""
+        counts = self._counts
         if not self._is_lockstep:
             self._await_last()
-        overdue = self._asked.count_overdue(self._listened_s)
-        if not self._counts["answers"]:  # nobody knows whether it works at all
-            overdue = len(self._asked)
+        # Of one that has answered nothing nobody knows whether it works at all: all is overdue.
+        overdue = self._asked.count_overdue(self._listened_s if counts["answers"] else math.inf)
         code = self._link.end()
         self._keep_talk()
         if code:
             told = f"{self._link.name} ended with exit code {code}{self._last_words()}"
             self._context.log("warning", told)
-        counts, summary = self._counts, dict[str, Any](self._counts)
+        summary: dict[str, Any] = {**counts, "mail_unsent": sum(map(len, self._mail.values()))}
         if self._link.program is not None:
             lines, size_bytes = self._link.program.talk_counts
             summary |= {"stderr_lines": lines, "stderr_bytes": size_bytes, "exit_code": code}
@@ -356,9 +356,9 @@ class ExternalFlight:
             self._record_answer(asked, came_s)
 
     def _record_answer(self, asked: AskedTick, came_s: float) -> None:
-        sent_s, asked_s = asked
-        tick, answer_us = round(asked_s * self._context.tick_hz), round((came_s - sent_s) * 1e6, 1)
-        self._agent.record("flight_answers", (tick, asked_s, answer_us))
+        tick = tick_of(asked.t_s, self._context.tick_hz)
+        row = (tick, asked.t_s, round((came_s - asked.sent_s) * 1e6, 1))
+        self._agent.record("flight_answers", row)
 
     def _record_clock(self, t_s: float) -> None:
         if t_s - self._clock_s < CLOCK_S:

@@ -55,7 +55,7 @@ class FlightLink:
         self._is_lockstep = is_lockstep
         self._has_thread = not is_lockstep  # what came between two ticks has its own time
         self._thread: ArrivalThread | None = None
-        self.transport: Transport = make_transport(given.transport, values, base_directory, devices)
+        self.transport: Transport = make_transport(given, values, base_directory, devices)
         self.program: FlightProgram | None = None
         self._has_ended = False
         self._code: int | None = None

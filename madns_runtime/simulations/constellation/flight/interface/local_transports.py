@@ -136,13 +136,15 @@ class DeviceLink(Transport):
 
     Args:
         device: As the agent sees it.
+        protocol: That which finds its packets in a stream of bytes itself; empty for one that may want whole frames.
     """
 
     may_lose = True
 
-    def __init__(self, device: DeviceView) -> None:
+    def __init__(self, device: DeviceView, *, protocol: str) -> None:
         super().__init__(f"device {device.name}")
         self._device = device
+        self._protocol = protocol
         self.counts |= {"bytes_dropped": 0}
         """Of a flood: what came in a tick beyond READ_BYTES; the newest are kept, so that no answer waits behind it."""
 
@@ -156,12 +158,18 @@ class DeviceLink(Transport):
         Ask for what came before.
 
         Raises:
-            BlamedError: It has no queue of frames.
+            BlamedError: It has no queue of frames, or these are lines without their ends.
         """
         try:
             self._device.frames(RECEIVED)
+            is_line = self._device.form_of(RECEIVED).is_line
         except PluginError as error:
             raise BlamedError(f"{self.name}: {error}") from error
+        if is_line and self._protocol:
+            raise BlamedError(
+                f"{self.name}: expected bytes as they come, among which {self._protocol} finds the ends of its packets, got"
+                " lines from which they are taken: give the device framing: raw"
+            )
 
     def write(self, packets: Sequence[bytes]) -> bool:
         """

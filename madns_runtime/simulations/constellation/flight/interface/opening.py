@@ -90,7 +90,7 @@ def make_protocol(name: str, base_directory: Path) -> FlightProtocol:
 
 
 def make_transport(
-    given: settings.AnyTransport,
+    interface: settings.FlightInterface,
     values: Mapping[str, str],
     base_directory: Path,
     devices: Mapping[str, Any],
@@ -99,7 +99,7 @@ def make_transport(
     Return a transport, not yet open.
 
     Args:
-        given: From the scenario.
+        interface: From the scenario.
         values: What stands for ${name} and the others in its addresses.
         base_directory: Folder of the scenario.
         devices: Those that the agent uses.
@@ -107,6 +107,7 @@ def make_transport(
     Raises:
         BlamedError: An address is none, or there is no such device.
     """
+    given = interface.transport
     if isinstance(given, settings.StdioTransport):
         return StdioLink("stdio")
     if isinstance(given, settings.PtyTransport):
@@ -122,7 +123,9 @@ def make_transport(
         return SocketLink(f"unix {path}", socket.AF_UNIX, path, listens=given.listen)
     if isinstance(given, settings.UdpTransport):
         return _udp(given, values)
-    return DeviceLink(find_device(devices, substitute(given.device, values)))
+    device = find_device(devices, substitute(given.device, values))
+    is_stream = interface.protocol in settings.PROTOCOLS
+    return DeviceLink(device, protocol=interface.protocol if is_stream else "")
 
 
 def _udp(given: settings.UdpTransport, values: Mapping[str, str]) -> UdpLink:
