@@ -20,8 +20,8 @@ from typing import Annotated, Any, Final
 from annotated_types import Gt, Le
 
 from madns_runtime.config import AgentLaunch, Agents, DeviceLaunch, RunConfig
+from madns_runtime.declared_bounds import bound_faults
 from madns_runtime.errors import ConfigurationError, MadnsError, PluginError
-from madns_runtime.hardware.bounds import bound_faults
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.manager import DeviceManager
 from madns_runtime.hardware.port import Hardware
