@@ -162,5 +162,5 @@ class FlightSoftware(Protocol):
         """Take that a message of one's own was refused, and why; called right before a tick."""
 
     def finish(self) -> Mapping[str, Any]:
-        """Return a summary: plain numbers and texts."""
+        """Return a summary: plain numbers and texts. No tick follows: it can neither command nor send any more."""
         return {}
