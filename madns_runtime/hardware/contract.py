@@ -162,7 +162,8 @@ class Device:
     """
     One device: subclass it and override what is needed.
 
-    It is made with an instance of its kind's parameters. Whatever a method raises is told by machine and device; the
+    It is made with an instance of its kind's parameters, and then touches nothing: a process that stands by to make it safe
+    has made one, too, while it is driven. Whatever a method raises is told by machine and device; the
     device is then closed and opened anew, after 0.1 s at first and 1 s at most.
     """
 

@@ -34,6 +34,7 @@ SETUP = SetupReport(
     agents=("agent-01",),
     index=0,
     tick_hz=10.0,
+    rate_hz=10.0,
     duration_s=60.0,
     epoch_utc="2026-01-01T00:00:00Z",
     frame="TEME",

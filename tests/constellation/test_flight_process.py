@@ -204,6 +204,7 @@ print("{}", flush=True)
         "agents": ["agent-01", "agent-02"],
         "index": 0,
         "tick_hz": HZ,
+        "rate_hz": HZ,
         "duration_s": 60.0,
         "epoch_utc": "2026-01-01T00:00:00Z",
         "frame": "TEME",

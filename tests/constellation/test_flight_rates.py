@@ -36,7 +36,7 @@ class Logger:
         self.results.append((len(self.steps), result.status))
 
     def finish(self):
-        return {"steps": json.dumps(self.steps), "heard": json.dumps(self.heard), "results": json.dumps(self.results)}
+        return {"rate_hz": self.context.rate_hz, "steps": json.dumps(self.steps), "heard": json.dumps(self.heard), "results": json.dumps(self.results)}
 """
 BODY = {"inertia_kg_m2": [1.0, 1.2, 0.9], "rates_deg_s": [1.0, 2.0, 0.5]}
 
@@ -108,6 +108,13 @@ def test_a_rate_without_a_whole_ratio_is_refused(tmp_path, fly, rate_hz, words):
     assert any(words in fault for fault in faults)
     with pytest.raises(BlamedError, match="parameters.flight.rate_hz"):
         fly(rate_hz, until_s=0.1)
+
+
+@pytest.mark.parametrize(("rate_hz", "expected"), [(None, 10.0), (2.0, 2.0), (50.0, 50.0)])
+def test_flight_software_is_told_its_own_rate(fly, rate_hz, expected):
+    star = fly(rate_hz, until_s=0.1)
+
+    assert star.summaries()["agent-01"]["flight"]["rate_hz"] == expected
 
 
 def test_slow_flight_software_steps_at_its_own_times_and_is_given_all_it_missed(fly):

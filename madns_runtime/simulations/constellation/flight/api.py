@@ -87,6 +87,9 @@ class FlightContext(Protocol):
     index: int
     """Place of this one among them, from 0."""
     tick_hz: float
+    """Of the vehicle."""
+    rate_hz: float
+    """Of its own steps: `flight.rate_hz`, else that of the ticks."""
     duration_s: float
     epoch_utc: str
     """UTC of simulated time zero, ISO 8601."""

@@ -145,6 +145,7 @@ class ExternalFlight:
             agents=context.agents,
             index=context.index,
             tick_hz=context.tick_hz,
+            rate_hz=context.rate_hz,
             duration_s=context.duration_s,
             epoch_utc=context.epoch_utc,
             frame=context.frame,
@@ -259,8 +260,7 @@ class ExternalFlight:
         }
         # Traffic depends on clocks, which nothing in lockstep does; what was lost is told all the same.
         lost = ("packets_", "peers_", "bytes_dropped")
-        counts = transport.counts.items()
-        summary |= {name: n for name, n in counts if n and name.startswith(lost)}
+        summary |= {name: n for name, n in transport.counts.items() if n and name.startswith(lost)}
         if not self._is_lockstep:
             summary |= transport.counts
             if (estimate := self._clock.estimate()) is not None:

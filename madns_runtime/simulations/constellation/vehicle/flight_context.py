@@ -93,6 +93,7 @@ class VehicleContext:
         rejoined_tick = max(0, math.ceil(context.now_s() * context.tick_hz))
         flight = flight_of(parameters, context.name, initial.satellite)
         rate = flight_rate(None if flight is None else flight.rate_hz, context.tick_hz)
+        self.rate_hz = rate.hz
         steps = rejoined_tick * rate.steps_per_tick
         self.first_number = steps * COMMANDS_PER_TICK_MAX
         """Of its first command: 0, or more in a vehicle that rejoined the run."""

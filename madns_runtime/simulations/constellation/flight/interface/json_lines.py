@@ -88,6 +88,7 @@ SETUP: Final[Mapping[str, Schema]] = {
     "agents": {"type": "array", "items": TEXT},
     "index": WHOLE,
     "tick_hz": NUMBER,
+    "rate_hz": NUMBER,
     "duration_s": NUMBER,
     "epoch_utc": TEXT,
     "frame": TEXT,

@@ -23,6 +23,9 @@ class SetupReport:
     agents: tuple[str, ...]
     index: int
     tick_hz: float
+    """Of the vehicle."""
+    rate_hz: float
+    """Of its own steps, and so of the reports."""
     duration_s: float
     epoch_utc: str
     frame: str
