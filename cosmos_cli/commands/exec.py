@@ -18,6 +18,7 @@ from cosmos_cli.commands.fleet_command import (
     InventoryOption,
     LimitOption,
     fleet_of,
+    warn_of_same,
 )
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.connection import Completed, Connection
@@ -68,6 +69,7 @@ def exec(  # noqa: A001 - the verb's name is the function's
     if not any(word.strip() for word in command):
         raise InputError("expected a command behind --, got an empty text")
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
+    warn_of_same(console, fleet)
     line = command[0] if len(command) == 1 else shlex.join(command)
     width = max(len(target.name) for target in fleet.targets)
     try:

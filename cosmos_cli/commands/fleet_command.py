@@ -12,6 +12,7 @@ from cosmos_cli.fleet.fleet import Fleet, fleet_of
 from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.pool import FORKS_DEFAULT
 from cosmos_cli.fleet.retry_file import offer_retry
+from cosmos_cli.fleet.target import same_targets
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.ui.console import Console
@@ -142,6 +143,16 @@ def without_this_computer(console: Console, fleet: Fleet) -> Fleet:
         if target.connection == "local":
             console.say(f"{target.name}: left alone, it is this computer")
     return fleet.elsewhere()
+
+
+def warn_of_same(console: Console, fleet: Fleet) -> None:
+    """Tell of machines that are one, by what the inventory says: it is worked on once for each of its names."""
+    for name, first in same_targets(fleet.targets).items():
+        address = next(target.address for target in fleet.targets if target.name == name)
+        console.say(
+            f"warning: {first} and {name} are one machine, {address}, which is worked on for each: correct"
+            " ansible_host, or leave one of them out (--limit)"
+        )
 
 
 def finish(

@@ -19,6 +19,7 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     finish,
     fleet_of,
+    warn_of_same,
     without_this_computer,
 )
 from cosmos_cli.errors import InputError
@@ -87,6 +88,7 @@ def packages(
     console = Console(json=json, quiet=quiet, instead=WORK_GOES_ON)
     wanted = check_names(action, names or [])
     fleet = without_this_computer(console, fleet_of(inventory, limit, forks, accept_new_host_keys))
+    warn_of_same(console, fleet)
     start_s = time.monotonic()
     outcomes = _change(console, fleet, action, wanted, timeout_s=timeout_s, is_check=check)
     return finish(

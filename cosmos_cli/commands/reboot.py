@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from collections.abc import Sequence
@@ -23,7 +24,8 @@ from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.fleet import Fleet
 from cosmos_cli.fleet.open_connection import connect
 from cosmos_cli.fleet.outcome import Outcome, failed
-from cosmos_cli.fleet.reboot import Rebooted, Rebooting
+from cosmos_cli.fleet.reboot import Rebooted, Rebooting, same_words
+from cosmos_cli.fleet.target import same_targets
 from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption, confirm
 from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
@@ -111,7 +113,15 @@ def _reboot(
     def tell(outcome: Outcome[Rebooted]) -> None:
         console.data(f"{outcome.machine:<{width}}  {_words(outcome)}")
 
-    return fleet.each_target(rebooting.reboot, tell)
+    same = same_targets(fleet.targets)  # while it goes down, a second login there would fail
+    once = tuple(target for target in fleet.targets if target.name not in same)
+    done = dataclasses.replace(fleet, targets=once).each_target(rebooting.reboot, tell)
+    outcomes = {outcome.machine: outcome for outcome in done}
+    for name, first in same.items():
+        left_alone = Rebooted(boot_id="", why_not=same_words(first))
+        outcomes[name] = Outcome(machine=name, value=left_alone)
+        tell(outcomes[name])
+    return [outcomes[target.name] for target in fleet.targets]
 
 
 def _words(outcome: Outcome[Rebooted]) -> str:
@@ -141,6 +151,6 @@ def _mapping(outcome: Outcome[Rebooted]) -> dict[str, Any]:
         {
             "status": status,
             "back_s": None if back_s is None else round(back_s, 2),
-            "boot_id": done.boot_id if done else None,
+            "boot_id": (done.boot_id or None) if done else None,
         }
     )

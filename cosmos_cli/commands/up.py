@@ -16,6 +16,7 @@ from cosmos_cli.commands.fleet_command import (
     InventoryOption,
     LimitOption,
     fleet_of,
+    warn_of_same,
 )
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.helper import Helper
@@ -68,6 +69,7 @@ def up(
     start_s = time.monotonic()
     console = Console(json=json, quiet=quiet, instead=WORK_GOES_ON)
     fleet = fleet_of(inventory, limit, forks, accept_new_host_keys)
+    warn_of_same(console, fleet)
     names = [target.name for target in fleet.targets]
 
     def gather() -> FleetUp:

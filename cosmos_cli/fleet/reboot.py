@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from cosmos_cli.fleet.connection import SMALL_BYTES_MAX, Connection, ConnectOptions
@@ -50,29 +50,41 @@ class Rebooting:
     """Whether a living run, or another command at work there, is no reason against it."""
     options: ConnectOptions = ConnectOptions()
     connect: Connect
+    claims: dict[tuple[str, str], str] = field(default_factory=dict)
+    """Name in whose stead a machine is rebooted, by its boot before and after and its own name; shared by all threads."""
 
     def reboot(self, connection: Connection) -> Rebooted:
         """
-        Reboot a machine and wait until it is back.
+        Reboot a machine and wait until it is back; one that another name of the inventory stands for, too, only once.
 
         Raises:
             MachineFailure: A run lives there, it refused, or it was not back in time.
         """
-        boot_id, start_s = self._order(connection)
-        if boot_id == self.own_boot_id:
-            return Rebooted(boot_id=boot_id, why_not="it is this computer")
+        ordered = self._order(connection)
+        if isinstance(ordered, Rebooted):
+            return ordered
+        (boot_id, node), start_s = ordered
         connection.close()
         new_boot_id = self._wait(connection.target, boot_id, start_s + self.timeout_s)
+        self._claim(new_boot_id, node, connection.target.name)
         return Rebooted(boot_id=new_boot_id, back_s=time.monotonic() - start_s)
 
-    def _order(self, connection: Connection) -> tuple[str, float]:
-        """Give the order, none to this computer; return which boot is to end, and when that was."""
+    def _claim(self, boot_id: str, node: str, name: str) -> str:
+        """Return by which name the machine is rebooted: this one, unless another came first."""
+        return self.claims.setdefault((boot_id, node), name) if boot_id else name
+
+    def _order(self, connection: Connection) -> tuple[tuple[str, str], float] | Rebooted:
+        """Give the order, and return which boot is to end, and when that was; or why the machine is left alone."""
         layout = Layout(connection.target.root)
         with Helper.start(connection, PARTS) as board:
             told = board.call("boot", {"state": layout.state, "root": layout.root}).value
-            boot_id = str(told["boot_id"])
+            boot_id, node = str(told["boot_id"]), str(board.greeting["node"])
             if boot_id == self.own_boot_id:
-                return boot_id, time.monotonic()
+                return Rebooted(boot_id=boot_id, why_not="it is this computer")
+            if (
+                first := self._claim(boot_id, node, connection.target.name)
+            ) != connection.target.name:
+                return Rebooted(boot_id=boot_id, why_not=same_words(first))
             if board.greeting["uid"] != 0:  # who is root already becomes nobody
                 require_root(connection.target, ROOT_ADVICE)
             if not self.is_forced:
@@ -86,7 +98,7 @@ class Rebooting:
                 # A connection that breaks on the order is what it should be: the machine goes down.
                 if failure.kind not in (FailureKind.LOST, FailureKind.TIMEOUT):
                     raise
-        return boot_id, start_s
+        return (boot_id, node), start_s
 
     def _wait(self, target: Target, boot_id: str, until_s: float) -> str:
         """Return the new boot's name."""
@@ -125,6 +137,11 @@ class Rebooting:
                 done.exit_status == 0
             )  # else what came is the words of a shell that lets nobody in
             return done.stdout.decode(errors="replace").strip() if is_told else ""
+
+
+def same_words(name: str) -> str:
+    """Say why a machine is left alone that is rebooted already, by *name*."""
+    return f"it is {name}, under another name"
 
 
 def refuse_if_living(living: Sequence[Mapping[str, Any]]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -84,6 +84,18 @@ def require_root(target: Target, advice: str) -> None:
     """
     if not target.may_become_root:
         raise MachineFailure(FailureKind.NO_SUDO, ROOT_FORBIDDEN, advice)
+
+
+def same_targets(targets: Iterable[Target]) -> dict[str, str]:
+    """Return the names of machines that are reached exactly as an earlier one, each with the name of that one."""
+    first: dict[tuple[str, int | None, str | None], str] = {}
+    found = {}
+    for target in targets:
+        if target.connection != "local":
+            name = first.setdefault((target.address, target.port, target.user), target.name)
+            if name != target.name:
+                found[target.name] = name
+    return found
 
 
 def target_of(machine: Machine) -> Target:

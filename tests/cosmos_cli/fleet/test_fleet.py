@@ -7,6 +7,7 @@ from typing import get_args
 import pytest
 from harness.waiting import wait_until
 
+from cosmos_cli.commands.fleet_command import warn_of_same
 from cosmos_cli.fleet import fleet as module
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -18,6 +19,7 @@ from cosmos_cli.models.connection_kind import (
     AnsibleConnection,
     ConnectionKind,
 )
+from cosmos_cli.ui.console import Console
 
 WAIT_S = 20.0
 TARGETS = tuple(Target(name=f"pi{n}", address=f"10.0.0.{n}") for n in range(3))
@@ -163,3 +165,16 @@ def test_machine_that_answers_nowhere_is_told_with_both_addresses(network):
     with pytest.raises(MachineFailure) as caught:
         connect(TARGETS[2], LISTED)
     assert "inventory" not in str(caught.value)
+
+
+def test_two_names_of_one_machine_are_warned_of(capsys):
+    places = {"a": ("10.0.0.1", None), "b": ("10.0.0.1", None), "c": ("10.0.0.1", 2222)}
+    targets = [Target(name=name, address=at, port=port) for name, (at, port) in places.items()]
+    local = [Target(name=name, address="here", connection="local") for name in ("d", "e")]
+
+    warn_of_same(Console(), Fleet(targets=(*targets, *local)))
+
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(
+        "warning: a and b are one machine, 10.0.0.1, which is worked on for each"
+    )

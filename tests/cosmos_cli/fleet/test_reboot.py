@@ -45,7 +45,7 @@ class PlayedBoard:
     """Answers as told; what it was asked is in `asked`."""
 
     living: Sequence[dict[str, str]] = ()
-    greeting: Mapping[str, int] = MappingProxyType({"uid": 1000})
+    greeting: Mapping[str, Any] = MappingProxyType({"uid": 1000, "node": "pi01"})
     failures: dict[str, MachineFailure]
     asked: list[str]
 
@@ -110,6 +110,21 @@ def test_machine_is_back_when_another_boot_answers(board: type[PlayedBoard]) -> 
     assert connection.is_closed
 
 
+def test_machine_of_two_names_is_rebooted_once(board: type[PlayedBoard]) -> None:
+    """Its other name may come while it goes down, or when it is back."""
+    other = PlayedConnection()
+    other.target = dataclasses.replace(TARGET, name="imu", address="10.0.1.1")
+    twice = rebooting("new")
+
+    done = twice.reboot(PlayedConnection())
+    meanwhile = twice.reboot(other)
+
+    assert (done.boot_id, done.why_not) == ("new", "")
+    assert meanwhile.why_not == "it is pi01, under another name"
+    assert twice.claims == {("old", "pi01"): "pi01", ("new", "pi01"): "pi01"}
+    assert board.asked == ["boot", "lock", "reboot", "boot"]
+
+
 def test_words_of_a_machine_that_runs_nothing_yet_are_no_boot(board: type[PlayedBoard]) -> None:
     done = rebooting("refused: it is starting", "new").reboot(PlayedConnection())
 
@@ -135,7 +150,7 @@ def test_sudo_that_the_inventory_forbids_is_not_used(
 ) -> None:
     connection = PlayedConnection()
     connection.target = dataclasses.replace(TARGET, may_become_root=False)
-    board.greeting = {"uid": uid}
+    board.greeting = {"uid": uid, "node": "pi01"}
 
     if is_done:  # who logs in is root already
         assert rebooting("new").reboot(connection).boot_id == "new"
@@ -262,6 +277,33 @@ def test_this_computer_is_left_alone_and_failures_are_told(
     assert "pi01  left alone: it is this computer\n" in captured.out
     assert "pi02  failed  no answer; switch it on\n" in captured.out
     assert "2 machines: 0 back, 1 left alone, 1 failed in " in captured.out
+
+
+def test_second_name_of_one_address_is_left_alone(
+    board: type[PlayedBoard],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def connect(target: Target, options: ConnectOptions) -> PlayedConnection:
+        connection = PlayedConnection("new")
+        connection.target = target
+        return connection
+
+    monkeypatch.setattr("cosmos_cli.fleet.fleet.connect", connect)
+    monkeypatch.setattr("cosmos_cli.commands.reboot.connect", connect)
+    path = tmp_path / "inventory.yaml"
+    path.write_text(
+        "all: {hosts: {imu: {ansible_host: pi01}, pi01: {}, same: {ansible_host: pi01}}}\n"
+    )
+
+    code = cosmos(["reboot", "-i", str(path), "--yes"])
+
+    captured = capsys.readouterr()
+    assert code == 0
+    assert board.asked == ["boot", "lock", "reboot"]
+    assert "pi01  left alone: it is imu, under another name\n" in captured.out
+    assert "3 machines: 1 back, 2 left alone in " in captured.out
 
 
 @pytest.mark.process
