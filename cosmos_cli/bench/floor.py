@@ -15,7 +15,7 @@ from cosmos_cli.models.inventory import Machine
 from cosmos_cli.ui.console import Column
 from madns_runtime.config import Scheduling
 
-PARTS = ("files", "links", "facts", "udp_probe", "timing_floor")
+PARTS = ("files", "links", "dpkg", "facts", "udp_probe", "timing_floor")
 RATES_HZ: Final = (100.0, 1000.0)
 LINK_RATE_HZ: Final = 100.0
 """Over the network: the answers of this computer's one responder to all machines are not to be what is measured."""

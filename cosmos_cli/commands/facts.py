@@ -21,7 +21,7 @@ from cosmos_cli.models.machine_facts import MachineFacts
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
 
-PARTS = ("files", "links", "facts")
+PARTS = ("files", "links", "dpkg", "facts")
 TIMEOUT_S = 60.0
 GIB = 1024**3
 COLUMNS = (

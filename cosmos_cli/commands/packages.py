@@ -35,7 +35,7 @@ from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
 from madns_runtime.plain_values import first_few
 
-PARTS = ("files", "links", "facts", "scratch", "system", "apt_words", "apt")
+PARTS = ("files", "links", "dpkg", "facts", "scratch", "system", "apt_words", "apt")
 PIECE_TIMEOUT_S = 60.0
 """A sign of life comes each second; a slow card may hold one up."""
 TIMEOUT_S = 1800.0

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 PARTS = (
     "files",
     "links",
+    "dpkg",
     "facts",
     "madns_runtime.processes",
     "processes",

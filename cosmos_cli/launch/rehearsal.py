@@ -36,7 +36,7 @@ from cosmos_cli.provision.environment import ask_installed, installed_request
 from madns_runtime.timing.rate import count_ticks
 
 PARTS = (
-    *("files", "links", "facts", *STORE_PARTS),
+    *("files", "links", "dpkg", "facts", *STORE_PARTS),
     *("madns_runtime.processes", "processes", "udp_probe"),
 )
 TIMEOUT_S = 60.0

@@ -22,7 +22,7 @@ from cosmos_cli.onboard.apt_words import (
     planned_changes,
     trouble_of,
 )
-from cosmos_cli.onboard.facts import DPKG_QUERY, versions_of
+from cosmos_cli.onboard.dpkg import DPKG_QUERY, versions_of
 from cosmos_cli.onboard.request_loop import AnswerPart, HelperRefusal, VerbRequest, verb
 from cosmos_cli.onboard.scratch import scratch_file, scratch_folder
 from cosmos_cli.onboard.system import SIGN_OF_LIFE_S, read_end, start, tool_path, wait

@@ -14,8 +14,9 @@ import resource
 import sys
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
+from cosmos_cli.onboard.dpkg import installed_versions
 from cosmos_cli.onboard.files import content_hash, look_at, user_name
 from cosmos_cli.onboard.links import (
     TEXT_BYTES_MAX,
@@ -54,11 +55,6 @@ PROCESSOR_KEYS = (
     *(b"Features", b"CPU implementer", b"CPU architecture", b"CPU variant", b"CPU part"),
 )
 """Of /proc/cpuinfo: what tells processors of an x86-64 and of an ARM computer apart."""
-DPKG_QUERY = (
-    "dpkg-query",
-    "-W",
-    "-f=${Package} ${Architecture} ${db:Status-Status} ${Version}\\n",
-)
 
 
 @verb("several")
@@ -102,7 +98,7 @@ def facts(request: VerbRequest) -> dict[str, PlainValue]:
         "uses_pam": _uses_pam(etc) if asked.get("is_pam_asked") else None,
         "services": {name: service_state(name) for name in asked.get("services") or ()},
         **look(request),
-        "packages": _packages(asked.get("packages") or ()),
+        "packages": installed_versions(asked.get("packages") or ()),
         **(_end_sudo(sudo) if is_sudo_asked else {"sudo": None, "sudo_refusal": None}),
     }
 
@@ -304,23 +300,6 @@ def _file(path: str, how: str) -> dict[str, PlainValue]:
     except PermissionError:
         return {"kind": "denied"}
     return told
-
-
-def _packages(names: Sequence[str]) -> dict[str, str | None]:
-    """Tell the installed version of each package; what changes packages is in `apt`, and is heavier."""
-    found = versions_of(_output([*DPKG_QUERY, *names], TOOL_TIMEOUT_S) if names else "")
-    return {name: found.get(name) for name in names}
-
-
-def versions_of(said: str) -> dict[str, str]:
-    """Return what `DPKG_QUERY` tells: versions by name, and by name:architecture as well."""
-    found: dict[str, str] = {}
-    for line in said.splitlines():
-        words = line.split(" ")
-        if len(words) == 4 and words[2] == "installed":
-            found.setdefault(words[0], words[3])
-            found[f"{words[0]}:{words[1]}"] = words[3]
-    return found
 
 
 def service_state(name: str) -> dict[str, str]:

@@ -24,6 +24,7 @@ STORE_PARTS = (
 HELPER_PARTS = (
     "files",
     "links",
+    "dpkg",
     "facts",
     "sshd",
     *STORE_PARTS,

@@ -1,6 +1,8 @@
 """What is sent to a machine must run there, where nothing is installed: the standard library and its neighbours."""
 
 import ast
+import importlib
+import re
 import sys
 from pathlib import Path
 
@@ -70,3 +72,36 @@ def test_every_part_that_is_sent_is_there():
 
     assert len(parts) > 10
     assert parts <= {*SENT_TOO, *(file.stem for file in FILES)}
+
+
+def lists_of_parts():
+    """Yield every list of parts that a helper is started with, with where it stands."""
+    for file in sorted((ROOT / "cosmos_cli").rglob("*.py")):
+        if "templates" not in file.parts and re.search(
+            r"^\w*PARTS\b.*= \(", file.read_text(), re.M
+        ):
+            module = ".".join(file.relative_to(ROOT).with_suffix("").parts)
+            for name, parts in vars(importlib.import_module(module)).items():
+                if name.endswith("PARTS"):
+                    yield f"{module}.{name}", parts
+
+
+def needed_at_once(part):
+    """Yield the neighbours that a part imports as it is loaded."""
+    for node in ast.parse((ONBOARD / f"{part}.py").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom) and node.module.startswith(PACKAGE):
+            inner = node.module.removeprefix(PACKAGE).removeprefix(".")
+            yield from [inner] if inner else (alias.name for alias in node.names)
+
+
+def test_every_part_is_sent_with_the_parts_that_it_imports():
+    missing = {
+        (where, part, other)
+        for where, parts in lists_of_parts()
+        for part in parts
+        if part not in SENT_TOO
+        for other in needed_at_once(part)
+        if other not in (*parts, "request_loop")
+    }
+
+    assert missing == set()

@@ -22,6 +22,7 @@ from cosmos_cli.fleet.transfer_limits import RATE_BYTES_S_MIN
 ONBOARD = Path(cosmos_cli.__file__).parent / "onboard"
 VERB = re.compile(r'^@verb\("([^"]+)"\)', re.MULTILINE)
 PARTS = [
+    "dpkg",
     "facts",
     "content_store",
     "installed",

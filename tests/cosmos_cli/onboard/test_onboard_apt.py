@@ -18,7 +18,7 @@ from cosmos_cli.fleet.target import Target
 from cosmos_cli.onboard.apt_words import changes_between, kept_back, planned_changes, trouble_of
 
 PATIENCE_S = 120.0
-PARTS = ("files", "links", "facts", "scratch", "system", "apt_words", "apt")
+PARTS = ("files", "links", "dpkg", "facts", "scratch", "system", "apt_words", "apt")
 
 SAID = {
     "unknown": "Reading package lists...\nE: Unable to locate package nonexistent-foo",

@@ -1,0 +1,87 @@
+"""Installed packages of a machine, as dpkg knows them; nothing is changed, and no network is asked."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+
+TOOL_TIMEOUT_S = 5.0
+APT_CACHE_TIMEOUT_S = 20.0
+"""Of a slow board that must first make a cache of all that its package sources have."""
+DPKG_QUERY = (
+    "dpkg-query",
+    "-W",
+    "-f=${Package} ${Architecture} ${db:Status-Status} ${Version}\\n",
+)
+PROVIDES_QUERY = ("dpkg-query", "-W", "-f=${db:Status-Status} ${Package} ${Provides}\\n")
+
+
+def installed_versions(names: Sequence[str]) -> dict[str, str | None]:
+    """
+    Tell the installed version of each package; None for one that is not there.
+
+    A name that no package has, such as libasound-dev, is there when a package is that provides it, and that is told in
+    its place; apt would install nothing for it. One that is also a package's own is not: apt would install that.
+    """
+    found: dict[str, str] = versions_of(_said([*DPKG_QUERY, *names])) if names else {}
+    told: dict[str, str | None] = {name: found.get(name) for name in names}
+    missing = [name for name, version in told.items() if version is None and ":" not in name]
+    providers = providers_of(_said(PROVIDES_QUERY)) if missing else {}
+    provided = [name for name in missing if name in providers]
+    if provided:
+        virtual = virtual_names(_said(["apt-cache", "policy", *provided], APT_CACHE_TIMEOUT_S))
+        told |= {name: providers[name] for name in provided if name in virtual}
+    return told
+
+
+def versions_of(said: str) -> dict[str, str]:
+    """Return what `DPKG_QUERY` tells: versions by name, and by name:architecture as well."""
+    found: dict[str, str] = {}
+    for line in said.splitlines():
+        words = line.split(" ")
+        if len(words) == 4 and words[2] == "installed":
+            found.setdefault(words[0], words[3])
+            found[f"{words[0]}:{words[1]}"] = words[3]
+    return found
+
+
+def providers_of(said: str) -> Mapping[str, str]:
+    """Return which installed package provides a name, from what `PROVIDES_QUERY` tells: `a (= 1), b` behind its own."""
+    found: dict[str, str] = {}
+    for line in said.splitlines():
+        status, _, rest = line.partition(" ")
+        package, _, provided = rest.partition(" ")
+        if status == "installed":
+            for each in provided.split(","):
+                found.setdefault(each.strip().partition(" ")[0], package)
+    return found
+
+
+def virtual_names(said: str) -> set[str]:
+    """Return the names for which `apt-cache policy` knows no package to install."""
+    found: set[str] = set()
+    name = ""
+    for line in said.splitlines():
+        if not line.startswith(" "):
+            name = line.removesuffix(":")
+        elif line.split() == ["Candidate:", "(none)"]:
+            found.add(name)
+    return found
+
+
+def _said(command: Sequence[str], timeout_s: float = TOOL_TIMEOUT_S) -> str:
+    """Return what a program printed; nothing of one that is not there or came to no end."""
+    import subprocess  # 8 ms, which most looks need not wait for
+
+    try:
+        done = subprocess.run(
+            list(command),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=timeout_s,
+            env={**os.environ, "LC_ALL": "C"},
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.decode(errors="replace")
