@@ -107,11 +107,11 @@ class _Plan:
         )
 
     def put_back(self, setting: Setting) -> Iterator[Step]:
-        path, _, found = self._file_of(setting, None)
+        path, others, found = self._file_of(setting, None)
         known = self.memory.get(setting.key)
-        if known is None and not _is_ours(setting, found.text):
+        if known is None and (not _is_ours(setting, found.text) or found.text == others):
             return
-        before = (known or {}).get("file")
+        before = others or (known or {}).get("file")
         values = self._former_values(setting, (known or {}).get("values") or {})
         for _, value in values:
             if (refusal := setting.put_back_refusal(value, self.facts)) is not None:
@@ -137,13 +137,23 @@ class _Plan:
         )
 
     def _file_of(self, setting: Setting, value: Any) -> tuple[str, str, FileFact]:
+        """Return the path of a setting's file, its text for a value, or for others alone, and what it is now."""
         path = setting.file(self.desired.paths)
         found = self.facts.file(path)
         if found.kind in ("directory", "other") or (found.kind == "file" and found.text is None):
             text = f"{path}: expected a small file of text, or none"
             raise MachineFailure(FailureKind.STEP, text, "remove it there")
-        text = "" if value is None else _head(setting) + setting.line(value, self.facts) + "\n"
-        return path, text, found
+        lines = self._lines_of_others(setting, found.text)
+        if value is not None:
+            lines.append(setting.line(value, self.facts))
+        text = "".join(f"{line}\n" for line in sorted(lines))
+        return path, text and _head(setting) + text, found
+
+    def _lines_of_others(self, setting: Setting, text: str | None) -> list[str]:
+        """Return what the file holds for other logins: each has a memory of its own there, but the file is one."""
+        lines = (text or "").splitlines() if _is_ours(setting, text) else ()
+        said = (line for line in lines if line.strip() and not line.startswith("#"))
+        return [line for line in said if not setting.is_own(line, self.facts)]
 
     def _former_values(self, setting: Setting, former: Mapping[str, str]) -> list[list[str]]:
         """Return the values to put back; one that has come since, or has another name now, is like its kin."""

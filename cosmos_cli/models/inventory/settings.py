@@ -33,6 +33,8 @@ class Setting:
     """File that keeps it for the next start; no other setting has that file."""
     line: Callable[[Any, MachineFacts], str]
     """Line of that file."""
+    is_own: Callable[[str, MachineFacts], bool] = lambda line, facts: True
+    """Whether a line of that file is of who logs in; those of others stay."""
     kernel_files: Callable[[SystemPaths], tuple[str, ...]] = lambda paths: ()
     """Files of the running kernel that must be read before `live` can answer."""
     live: Callable[[MachineFacts, SystemPaths], dict[str, str]] = lambda facts, paths: {}
@@ -171,6 +173,7 @@ class SettingVariables(BaseModel):
         Setting(
             file=lambda paths: f"{paths.etc}/security/limits.d/90-cosmos.conf",
             line=lambda value, facts: f"{facts.user} - rtprio {value}",
+            is_own=lambda line, facts: line.split()[0] == facts.user,
         )
     )
     """Highest real-time priority that the user may take; as it is if not given."""

@@ -112,6 +112,36 @@ def test_settings_are_made_once():
     assert machine.plan(**ALL) == []
 
 
+def test_logins_of_one_machine_share_the_file_of_priorities():
+    """Each has its own folder of COSMoS there, and so its own memory."""
+    limits = "/etc/security/limits.d/90-cosmos.conf"
+    machine, memories = Machine(), {"pi": {}, "anna": {}}
+
+    def up(user, **variables):
+        facts = dataclasses.replace(machine.facts(), user=user)
+        mine = {path: FileFact(kind="file", text=text) for path, text in memories[user].items()}
+        facts = dataclasses.replace(facts, files={**facts.files, **mine})
+        steps = list(setting_steps(facts, wanted(variables=variables)))
+        for request in (request for step in steps for request in step.requests):
+            machine.do(request)
+        memories[user] = (
+            {MEMORY: machine.files.pop(MEMORY)} if MEMORY in machine.files else memories[user]
+        )
+        lines = machine.files.get(limits, "").splitlines()[1:]
+        return len(steps), lines
+
+    both = ["anna - rtprio 20", "pi - rtprio 50"]
+    assert up("pi", cosmos_realtime_priority=50) == (1, ["pi - rtprio 50"])
+    assert up("anna") == (0, ["pi - rtprio 50"])
+    assert up("anna", cosmos_realtime_priority=20) == (1, both)
+    assert up("pi", cosmos_realtime_priority=50) == (0, both)
+    assert up("pi", cosmos_realtime_priority=60) == (1, ["anna - rtprio 20", "pi - rtprio 60"])
+    assert up("pi") == (1, ["anna - rtprio 20"])
+    assert up("pi") == (0, ["anna - rtprio 20"])
+    assert up("anna") == (1, [])
+    assert limits not in machine.files
+
+
 def test_settings_are_put_back():
     machine = Machine()
     before = machine.state
