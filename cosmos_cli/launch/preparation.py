@@ -7,10 +7,12 @@ import ipaddress
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.fleet.connection import Connection, ConnectOptions, address_here
 from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.fleet.helper import Helper
+from cosmos_cli.fleet.ssh.link_local import address_from
 from cosmos_cli.fleet.target import Target, target_of
 from cosmos_cli.launch.machines import Connect, Prepared, RemoteMachine, reach_machines
 from cosmos_cli.launch.plan import LaunchPlan
@@ -100,7 +102,12 @@ def places_of(
     run: RunDirectory,
     session_hex: str,
 ) -> dict[str, MachineConfig]:
-    """Return what each machine is told differently, by name."""
+    """
+    Return what each machine is told differently, by name.
+
+    Raises:
+        InputError: It is not known how one of them reaches the host.
+    """
     host = remote.get(plan.host.name) if plan.host else None
     return {
         name: MachineConfig(
@@ -123,7 +130,12 @@ def places_of(
 def _host_address(
     machine: Machine, here: RemoteMachine | None, host: RemoteMachine | None, config: RunConfig
 ) -> str:
-    """Return how a machine reaches the host: as its inventory says, else as the connections show."""
+    """
+    Return how a machine reaches the host: as its inventory says, else as the connections show.
+
+    Raises:
+        InputError: They show an address of the host that means nothing on the machine.
+    """
     if machine.variables.cosmos_host_address is not None:
         return machine.variables.cosmos_host_address
     if says_address(config):
@@ -131,7 +143,17 @@ def _host_address(
     if here is host:  # both on that machine, or both on this computer
         return LOOPBACK
     if host is not None:
-        return host.connection.peer_address
+        peer = host.connection.peer_address
+        if here is None:
+            return peer
+        own, at = here.connection.own_address, here.connection.peer_address
+        if (address := address_from(peer, own=own, at=at)) is None:
+            raise InputError(
+                f"{host.name}, which runs the host, is reached here by a link-local address, {peer}, and it is not known"
+                f" by which interface {machine.name} does: set cosmos_host_address of {machine.name}, or have"
+                f" ansible_host of {host.name} name an address of IPv4"
+            )
+        return address
     assert here is not None
     return here.connection.own_address
 

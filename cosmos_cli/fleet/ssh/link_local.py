@@ -19,6 +19,22 @@ LINK_LOCAL = re.compile(r"fe[89ab][0-9a-f]:[0-9a-f:]*", re.IGNORECASE)
 _SEEN = re.compile(r"(?P<address>[0-9A-Fa-f:]+)%(?P<interface>[A-Za-z0-9_.-]{1,15})")
 
 
+def address_from(peer: str, *, own: str, at: str) -> str | None:
+    """
+    Return the address of one machine as another one must name it, None if it has none there.
+
+    Args:
+        peer: The address at which the first is reached from here.
+        own: This computer's address as the other one sees it, as `address_as_seen` tells.
+        at: The address at which the other one is reached from here.
+    """
+    address, _, link = peer.partition("%")
+    if not LINK_LOCAL.fullmatch(address):
+        return peer
+    _, _, interface = own.partition("%")
+    return f"{address}%{interface}" if interface and at.partition("%")[2] == link else None
+
+
 def address_as_seen(own: str, run: Callable[..., Completed]) -> str:
     """
     Return an address of this computer with the machine's interface, if it is link-local, else as it is.

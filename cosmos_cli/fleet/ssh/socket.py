@@ -136,11 +136,18 @@ def connect_tcp(host: str, port: int, *, timeout_s: float) -> SshSocket:
             sock.settimeout(max(TIMEOUT_S_MIN, share_s))
             sock.connect(address)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            return SshSocket(sock, addresses=(sock.getsockname()[0], sock.getpeername()[0]))
+            return SshSocket(sock, addresses=(sock.getsockname()[0], _peer_address(sock)))
         except OSError as failed:
             sock.close()
             error = failed
     raise error
+
+
+def _peer_address(sock: socket.socket) -> str:
+    """Return the other end's address, a link-local one with the interface here on whose link it is."""
+    address, *_, scope = sock.getpeername()
+    is_on_link = sock.family == socket.AF_INET6 and scope
+    return f"{address}%{socket.if_indextoname(scope)}" if is_on_link else str(address)
 
 
 def connect_through_command(command: str) -> SshSocket:

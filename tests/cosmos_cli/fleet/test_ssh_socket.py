@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.fleet.ssh.socket import SEND_STALL_S_MAX, SshSocket
+from cosmos_cli.fleet.ssh.socket import SEND_STALL_S_MAX, SshSocket, _peer_address
 from cosmos_cli.fleet.ssh.stream import SshStream
 
 
@@ -47,3 +47,17 @@ def test_machine_that_takes_no_more_bytes_is_given_up_and_the_cause_is_told(cloc
 
     assert told.value.kind is FailureKind.LOST
     assert told.value.text == "the connection is lost (it takes no more bytes)"
+
+
+@pytest.mark.parametrize(
+    ("family", "name", "expected"),
+    [
+        (socket.AF_INET, ("10.0.0.1", 22), "10.0.0.1"),
+        (socket.AF_INET6, ("2001:db8::1", 22, 0, 0), "2001:db8::1"),
+        (socket.AF_INET6, ("fe80::1", 22, 0, 1), f"fe80::1%{socket.if_indextoname(1)}"),
+    ],
+)
+def test_link_local_address_of_a_machine_comes_with_its_link(family, name, expected):
+    sock = SimpleNamespace(family=family, getpeername=lambda: name)
+
+    assert _peer_address(sock) == expected

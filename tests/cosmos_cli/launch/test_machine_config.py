@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.launch.machines import expanded
@@ -68,6 +69,39 @@ def addresses(plan: LaunchPlan, config: RunConfig = CONFIG) -> dict[str, str | N
     there = {name: remote(name) for name in names if name.startswith("pi")}
     places = places_of(plan, there, config, run=RUN, session_hex=SESSION)
     return {name: place.host_address for name, place in places.items()}
+
+
+HOST_PEER = "fe80::b%enp3s0"
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "peer", "expected"),
+    [
+        ("pi2", "fe80::a%eth0", "fe80::c%enp3s0", "fe80::b%eth0"),
+        ("pi2", "fe80::a%eth0", "fe80::c%enp4s0", None),
+        ("pi2", "fe80::a", "fe80::c%enp3s0", None),
+        ("pi2", "10.0.0.1", "10.0.0.2", None),
+        ("laptop", "", "", HOST_PEER),
+        ("pi1", "fe80::a%eth0", HOST_PEER, "127.0.0.1"),
+    ],
+)
+def test_link_local_address_of_a_host_is_named_by_each_machines_own_interface(
+    name: str, own: str, peer: str, expected: str | None
+) -> None:
+    there = {each: remote(each) for each in ("pi1", "pi2")}
+    there["pi1"].connection = SimpleNamespace(own_address="fe80::a%eth0", peer_address=HOST_PEER)
+    there["pi2"].connection = SimpleNamespace(own_address=own, peer_address=peer)
+    planned = plan(machine(name, "local" if name == "laptop" else "ssh"), host=machine("pi1"))
+
+    if expected is None:
+        with pytest.raises(
+            InputError, match="pi1, which runs the host, .*set cosmos_host_address of pi2"
+        ):
+            places_of(planned, there, CONFIG, run=RUN, session_hex=SESSION)
+        return
+    places = places_of(planned, there, CONFIG, run=RUN, session_hex=SESSION)
+
+    assert places[name].host_address == expected
 
 
 def test_run_on_this_computer_alone_is_told_nothing_special() -> None:
