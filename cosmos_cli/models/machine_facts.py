@@ -173,6 +173,8 @@ class MachineFacts:
     """Trees, environments and wheels that nobody uses, such as trees/<hash>."""
     prunable_bytes: int = 0
     """Room that these take on the disk, at least."""
+    wheels: frozenset[str] = frozenset()
+    """Names of the dist-info folders of wheels that are there, if a wanted environment is not."""
 
     @classmethod
     def from_mapping(

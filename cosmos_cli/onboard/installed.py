@@ -49,6 +49,8 @@ def installed(request: VerbRequest) -> dict[str, PlainValue]:
         for name in names if asked.get("touch") else ():
             told[kind][name] = told[kind][name] and _touch(os.path.join(folders[kind], name))
     going = prunable(folders, wanted)
+    is_any_missing = not all(told["environments"].values())
+    told["wheels"] = wheels_there(folders["wheels"], going["wheels"]) if is_any_missing else []
     paths = [os.path.join(folders[kind], name) for kind, names in going.items() for name in names]
     return {**told, "prunable": going, "prunable_bytes": freed_bytes(paths)}
 
@@ -189,6 +191,13 @@ def prunable(folders: Mapping[str, str], wanted: Mapping[str, PlainValue]) -> di
         found[kind] = [os.path.basename(path) for path in rest if path not in in_use]
     found["wheels"] = _orphans(folders, found["environments"])
     return found
+
+
+def wheels_there(folder: str, going: Sequence[str]) -> list[str]:
+    """Return the names of the dist-info folders of whole wheels that stay: an environment takes no room for them."""
+    names = (name for name in content_store.names_in(folder) if name not in going)
+    marks = (content_store.read_mark(os.path.join(folder, name)) or {} for name in names)
+    return sorted({str(mark["info"]) for mark in marks if mark.get("info")})
 
 
 def freed_bytes(paths: Sequence[str]) -> int:

@@ -119,6 +119,7 @@ def _with_installed(facts: MachineFacts, told: Mapping[str, Any]) -> MachineFact
         environments=frozenset(key for key, is_whole in told["environments"].items() if is_whole),
         prunable=tuple(f"{kind}/{name}" for kind, names in prunable.items() for name in names),
         prunable_bytes=told.get("prunable_bytes", 0),
+        wheels=frozenset(told.get("wheels") or ()),
     )
 
 

@@ -57,6 +57,11 @@ class Locked:
     installed_bytes: int = 0
     """Of its files, unpacked."""
 
+    @property
+    def dist_info(self) -> str:
+        """Name of the folder in it that describes it."""
+        return "-".join(self.filename.split("-")[:2]) + ".dist-info"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Distributed:

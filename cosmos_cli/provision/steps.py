@@ -145,7 +145,7 @@ def _environments(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
                 kind=Kind.ENVIRONMENT,
                 title=f"environment {environment.key}: build with {len(environment.lock)} packages",
                 subject=environment,
-                size_bytes=environment.size_bytes,
+                size_bytes=environment.size_bytes(facts.wheels),
             )
 
 

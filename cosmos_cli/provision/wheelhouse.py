@@ -16,7 +16,7 @@ import importlib.metadata
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,10 +96,10 @@ class Environment:
         """Return the system packages that a machine must have before it can be installed."""
         return tuple(each.package for each in self.content.distributed)
 
-    @property
-    def size_bytes(self) -> int:
-        """Return what it takes on a machine: its wheels, which are kept there, and its files."""
-        return sum(wheel.size_bytes + wheel.installed_bytes for wheel in self.lock)
+    def size_bytes(self, there: Collection[str] = ()) -> int:
+        """Return what it takes on a machine at most: its wheels as they come, and unpacked; none that is *there*."""
+        missing = (wheel for wheel in self.lock if wheel.dist_info not in there)
+        return sum(wheel.size_bytes + wheel.installed_bytes for wheel in missing)
 
     def wheel(self, locked: Locked) -> Path:
         """Return where one of its wheels is here."""

@@ -117,6 +117,7 @@ def _installed(asked: Asked) -> Shape:
             "environments": map_with(asked["environments"], flag),
             "prunable": prunable,
             "prunable_bytes": size,
+            "wheels": names,
         }
     )
 

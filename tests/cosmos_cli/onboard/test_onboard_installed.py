@@ -75,6 +75,15 @@ def test_what_nobody_asks_for_and_is_removed_meanwhile_is_no_error(
     assert told["prunable"]["wheels"] == []
 
 
+def test_wheels_are_told_where_an_environment_is_to_be_built(folders):
+    mark = content_store.read_mark(f"{folders['wheels']}/one") | {"info": "numpy-2.0.0.dist-info"}
+    content_changes.mark_complete(f"{folders['wheels']}/one", mark)
+    os.mkdir(f"{folders['wheels']}/half")
+
+    assert ask(folders, "one")["wheels"] == []
+    assert ask(folders, "other")["wheels"] == ["numpy-2.0.0.dist-info"]
+
+
 def test_room_of_what_is_prunable_is_that_of_files_whose_last_name_goes(tmp_path):
     one, other, kept = (tmp_path / name for name in ("one", "other", "kept"))
     for folder in (one, other, kept):

@@ -153,6 +153,7 @@ INSTALLED = {
     "environments": {},
     "prunable": {"trees": ["a"], "environments": [], "wheels": []},
     "prunable_bytes": 4096,
+    "wheels": ["numpy-2.0.0.dist-info"],
 }
 ROUND_TRIPS = {"round_trips": {"count": 1}, "wake_ups": {"count": 1}}
 USES = {

@@ -42,12 +42,17 @@ def test_plan(case):
     assert [[s.kind.value, s.title, s.needs_root] for s in steps] == case["steps"]
 
 
+ENVIRONMENT_BYTES = 100_000_000
+
+
 @dataclass(frozen=True)
 class FakeEnvironment:
     key: str = "abc"
     lock: tuple = ("numpy", "msgpack")
     distribution_packages: tuple = ()
-    size_bytes: int = 100_000_000
+
+    def size_bytes(self, there=()):
+        return sum(ENVIRONMENT_BYTES // 2 for name in self.lock if name not in there)
 
 
 @dataclass(frozen=True)
@@ -183,7 +188,7 @@ def test_plan_that_needs_root_is_refused_with_what_sudo_says_of_it():
 
 def test_full_disk_is_refused_before_anything_is_sent():
     steps = plan_steps(facts_of(), wanted(environments=(FakeEnvironment(),)))
-    needed = FakeEnvironment.size_bytes + RESERVE_BYTES
+    needed = ENVIRONMENT_BYTES + RESERVE_BYTES
 
     check_possible(facts_of(disk={"free_bytes": needed}), steps)
 
@@ -193,10 +198,19 @@ def test_full_disk_is_refused_before_anything_is_sent():
     )
 
 
+def test_wheels_that_are_there_take_no_room():
+    """As those of the environment before, or of an `up` that was cut: it must find room to go on."""
+    facts = dataclasses.replace(facts_of(), wheels=frozenset({"numpy"}))
+    (step,) = plan_steps(facts, wanted(environments=(FakeEnvironment(),)))
+
+    assert step.size_bytes == ENVIRONMENT_BYTES // 2
+    check_possible(facts_of(disk={"free_bytes": ENVIRONMENT_BYTES}), (step,))
+
+
 @pytest.mark.parametrize("missing_bytes", [0, 1])
 def test_disk_without_room_for_all_is_pruned_before_anything_else_takes_room(missing_bytes):
     """Of what nobody uses three environments stay there: a fourth may find room only when the oldest has gone."""
-    needed, freed = FakeEnvironment.size_bytes + RESERVE_BYTES, 100_000_000
+    needed, freed = ENVIRONMENT_BYTES + RESERVE_BYTES, 100_000_000
     free = needed - freed - missing_bytes
     old = {"prunable": ("environments/old",), "prunable_bytes": freed}
     facts = facts_of(files={f"{HOME}/cosmos": None}, disk={"free_bytes": free}, **old)
