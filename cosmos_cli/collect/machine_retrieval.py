@@ -56,7 +56,7 @@ class Retrieved:
     packed_bytes: int = 0
     """The fetched bytes as they came over the wire."""
     resumed_bytes: int = 0
-    """Bytes of files that came this time which an earlier attempt had brought."""
+    """Bytes of files that came this time which an earlier collection had brought."""
     is_released: bool = True
     remark: str = ""
     """Why all of it still lies there as well; empty if it does not."""
@@ -95,6 +95,11 @@ class TransferAccount:
     packed_bytes: int = 0
     fetched: set[str] = field(default_factory=set)
     resumed: dict[str, int] = field(default_factory=dict)
+
+    def open(self, path: str, there_bytes: int) -> None:
+        """Note what is here of a file, each time that its transfer begins or goes on; what came meanwhile is fetched."""
+        if path not in self.fetched:
+            self.resumed[path] = min(there_bytes, self.resumed.get(path, there_bytes))
 
     def piece(self, size_bytes: int, packed_bytes: int) -> None:
         """Count a piece that has come."""
@@ -280,8 +285,7 @@ class MachineRetrieval:
                 account.here_bytes += file.size_bytes
                 continue
             account.here_bytes += transfer.offset
-            if transfer.resumed_bytes and file.path not in account.fetched:
-                account.resumed[file.path] = transfer.resumed_bytes
+            account.open(file.path, transfer.resumed_bytes)
             transfers.append(transfer)
         return transfers
 

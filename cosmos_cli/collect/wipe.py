@@ -8,7 +8,7 @@ that is asked for by name.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -168,7 +168,12 @@ def look(connection: Connection, known: Mapping[str, RunDirectory], *, is_all: b
     )
 
 
-def carry_out(connection: Connection, order: Order, holder: str) -> Wiped:
+def carry_out(
+    connection: Connection,
+    order: Order,
+    holder: str,
+    gone: Callable[[RunThere], None] = lambda run: None,
+) -> Wiped:
     """
     Delete on a machine what was decided, each thing only if it is still what it was.
 
@@ -176,6 +181,7 @@ def carry_out(connection: Connection, order: Order, holder: str) -> Wiped:
         connection: To the machine.
         order: What goes.
         holder: Who takes the machine's lock meanwhile.
+        gone: Told each run as it has been deleted.
 
     Raises:
         MachineFailure: Something changed, lives, or could not be deleted; what went is gone.
@@ -186,6 +192,7 @@ def carry_out(connection: Connection, order: Order, holder: str) -> Wiped:
         helper.call("lock", {"path": layout.lock, "holder": holder})
         for run in order.runs:
             _delete(helper, target, run)
+            gone(run)
         left: tuple[str, ...] = ()
         if order.is_root:
             root = {"root": layout.root, "state": layout.state}

@@ -87,22 +87,33 @@ def wipe(
     if orders and not confirm(_question(list(orders.values())), is_sure=yes):
         console.say("nothing was deleted")
         orders = {}
-    wiped = _carry_out(console, fleet, orders)
+    gone: dict[str, list[RunThere]] = {machine: [] for machine in orders}
+    wiped = _carry_out(console, fleet, orders, gone)
     # Only now: a table that nobody sees asks nobody, and nothing is deleted.
     told = dataclasses.replace(console, instead="the exit code tells whether a machine failed")
-    return _tell(told, fleet, found, wiped)
+    return _tell(told, fleet, found, {name: _with_gone(o, gone[name]) for name, o in wiped.items()})
+
+
+def _with_gone(outcome: Outcome[Wiped], gone: Sequence[RunThere]) -> Outcome[Wiped]:
+    """Return an outcome that has an account of what was deleted before a failure as well."""
+    if outcome.value is not None:
+        return outcome
+    names, size = tuple(run.name for run in gone), sum(run.bytes for run in gone)
+    return dataclasses.replace(outcome, value=Wiped(runs=names, bytes=size))
 
 
 def _carry_out(
-    console: Console, fleet: Fleet, orders: dict[str, Order]
+    console: Console, fleet: Fleet, orders: dict[str, Order], gone: dict[str, list[RunThere]]
 ) -> dict[str, Outcome[Wiped]]:
     chosen = dataclasses.replace(
         fleet, targets=tuple(target for target in fleet.targets if target.name in orders)
     )
-    outcomes = chosen.each_target(
-        lambda connection: carry_out(connection, orders[connection.target.name], HOLDER),
-        failure_teller(console),
-    )
+
+    def work(connection: Connection) -> Wiped:
+        name = connection.target.name
+        return carry_out(connection, orders[name], HOLDER, gone[name].append)
+
+    outcomes = chosen.each_target(work, failure_teller(console))
     return {outcome.machine: outcome for outcome in outcomes}
 
 
@@ -150,6 +161,8 @@ def _tell(
     for machine, value in done.items():
         for path in value.left:
             console.say(f"{machine}: kept {path}{_why(path)}")
+        if machine in failures and value.runs:
+            console.say(f"{machine}: deleted before it failed: {', '.join(value.runs)}")
     runs = counted(sum(len(value.runs) for value in done.values()), "run")
     size = size_words(sum(value.bytes for value in done.values()))
     kept = sum(len(o.value.kept) for o in found if o.value is not None)

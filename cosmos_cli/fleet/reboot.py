@@ -51,7 +51,7 @@ class Rebooting:
     options: ConnectOptions = ConnectOptions()
     connect: Connect
     claims: dict[tuple[str, str], str] = field(default_factory=dict)
-    """Who reboots a machine, by the boot that it ends or began with and the machine's own name; shared by all threads."""
+    """Name in whose stead a machine is rebooted, by its boot before and after and its own name; shared by all threads."""
 
     def reboot(self, connection: Connection) -> Rebooted:
         """

@@ -13,6 +13,7 @@ import pytest
 from harness.split_run import CutConnection, LyingConnection, SplitRun, frame_ends, hashes, pieces
 
 from cosmos_cli.collect import retrieve
+from cosmos_cli.collect.partial_files import PartWriter
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.local import LocalConnection
 
@@ -299,6 +300,30 @@ def test_interrupt_leaves_what_has_come(tmp_path, monkeypatch):
     assert seen
 
     assert split.retrieve()["pi01"].is_ok
+
+
+def test_bytes_that_came_over_a_link_that_broke_are_not_counted_twice(tmp_path, monkeypatch):
+    split = large_run(tmp_path)
+    total = sum(path.stat().st_size for path in split.directory("pi01").rglob("*.*"))
+    monkeypatch.setattr(retrieve, "ATTEMPTS_MAX", 2)
+    monkeypatch.setattr(retrieve, "PAUSE_S", 0.0)
+    monkeypatch.setattr(retrieve, "_connect", lambda target, options: LocalConnection(target))
+    write = PartWriter.write
+    pieces_left = [2]
+
+    def cut(self, value, body):
+        if self._transfers[value["file"]].file.path.endswith("noise.bin"):
+            pieces_left[0] -= 1
+            if pieces_left[0] == 0:
+                raise MachineFailure(FailureKind.LOST, "cut by the test")
+        return write(self, value, body)
+
+    monkeypatch.setattr(PartWriter, "write", cut)
+
+    told = split.retrieve()["pi01"].value
+
+    assert pieces_left[0] < 0
+    assert (told.fetched_bytes, told.resumed_bytes) == (total, 0)
 
 
 @pytest.mark.root

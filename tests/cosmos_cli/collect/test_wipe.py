@@ -245,6 +245,32 @@ def test_what_began_to_change_after_it_was_shown_is_kept(split, wipe, monkeypatc
     assert not split.directory("pi02").exists()
 
 
+def test_what_went_before_a_machine_failed_is_counted(split, wipe, monkeypatch):
+    from cosmos_cli.commands import wipe as command
+
+    old = split.directory("pi01").with_name("0000-old-00112233")
+    old.mkdir()
+    (old / "ticks.jsonl").write_text("1\n")
+
+    def change_then_agree(_question, *, is_sure):
+        (split.directory("pi01") / "new.jsonl").write_text("1\n")
+        return True
+
+    monkeypatch.setattr(command, "confirm", change_then_agree)
+
+    code, out, err = wipe("--uncollected", "--limit", "pi01", "--json")
+
+    told = json.loads(out)["machines"][0]
+    assert (code, told["ok"], old.exists(), split.directory("pi01").exists()) == (
+        3,
+        False,
+        False,
+        True,
+    )
+    assert (told["deleted"], told["deleted_bytes"]) == ([old.name], 2)
+    assert f"pi01: deleted before it failed: {old.name}" in err
+
+
 def test_machine_where_another_command_works_is_left_alone(split, wipe):
     import fcntl
 
