@@ -62,11 +62,6 @@ class Locked:
         """Name of the folder in it that describes it."""
         return "-".join(self.filename.split("-")[:2]) + ".dist-info"
 
-    @property
-    def dist_info(self) -> str:
-        """Name of the folder in it that describes it."""
-        return "-".join(self.filename.split("-")[:2]) + ".dist-info"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Distributed:
