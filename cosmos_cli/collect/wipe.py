@@ -70,7 +70,7 @@ class Findings:
     others: tuple[str, ...] = ()
     """Files in COSMoS's folder that are not COSMoS's."""
     living: tuple[str, ...] = ()
-    """What lives there of any run; only when all of it is to go."""
+    """Processes of any run that live there; only when all of it is to go."""
     has_root: bool = False
 
 

@@ -114,7 +114,7 @@ class Helper:
         self.machine = ""
         """Name of the machine; empty for a helper that was not started by `start`."""
         self.greeting: Mapping[str, Any] = {}
-        """What the process said of itself: python, executable, machine, bits, libc, uid, home, node, pid; empty before."""
+        """Account of the process of itself: python, executable, machine, bits, libc, uid, home, node, pid; empty before."""
 
     @classmethod
     def start(

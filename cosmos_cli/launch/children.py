@@ -34,7 +34,7 @@ class ChildRecord:
     machine: str | None
     pid: int | None
     doing: str = ""
-    """What the child does with the plug-in's code before it can be heard again; empty once that is done."""
+    """Use of the plug-in's code by the child before it can be heard again; empty once that is done."""
     has_exited: bool = False
     """Whether the end of the group's leader is known."""
     has_ended: bool = False
