@@ -16,12 +16,12 @@ from typing import Any
 from cosmos_cli.collect.remote_manifest import MANIFEST_NAME, RETRIEVED_NAME
 from cosmos_cli.collect.retrieval_state import retrieved_files
 from cosmos_cli.evidence.manifest import file_entry
-from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.run_directory import HOST_TABLE, RunDirectory
 from cosmos_cli.evidence.run_documents import MISSING, fault_of
 from cosmos_cli.evidence.streams import SUFFIX, StreamScan, is_linked
 
-MADE_ANEW = ("run.json", "report.html", "manifest.json")
-"""Written by every collection, as are the tables."""
+MADE_ANEW = ("run.json", "report.html", "manifest.json", HOST_TABLE)
+"""Written by every collection, as are the tables, or, as the last one, whenever somebody asks for it."""
 TABLES = "tables/"
 MACHINES = "machines/"
 WAS = "was"

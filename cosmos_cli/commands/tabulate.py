@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.collect.finished_run import collected_document
-from cosmos_cli.collect.host_tables import NAME, Wanted, layout_with, times_of, write_host_table
+from cosmos_cli.collect.host_tables import Wanted, layout_with, times_of, write_host_table
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import alone, runs_root
@@ -70,7 +70,7 @@ def tabulate(
     plan, result = found.read_json(found.plan_json), found.read_json(found.result_json)
     labels = TableLabels.of(config, result, plan)
     names = _chosen(config.agents.resolved_names(), agents or [], labels.agents)
-    path = output or found.path / f"{NAME}.parquet"
+    path = output or found.host_table
     with alone(found, must_own=output is None), told_progress(console, found.name) as progress:
         wanted = Wanted(agents=names, times_s=times_s, path=path, layout=layout_with(labels))
         written = write_host_table(found, config, wanted, progress)

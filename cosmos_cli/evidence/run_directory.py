@@ -50,6 +50,7 @@ RESERVE_BYTES = 1024 * 1024
 FOLDERS = ("host", "agents", "machines")
 """In every run directory from its beginning."""
 BUNDLE_SUFFIX = ".tar.zst"
+HOST_TABLE = "truth.parquet"
 RUNS_VARIABLE = "COSMOS_RUNS"
 RUNS_FOLDER = "runs"
 RUN_NAME = re.compile(rf"^([0-9]{{4,{len(str(NUMBER_MAX))}}})-(.+)$")
@@ -113,6 +114,11 @@ class RunDirectory:
     def tables(self) -> Path:
         """Folder of the Parquet tables."""
         return self.path / "tables"
+
+    @property
+    def host_table(self) -> Path:
+        """Table of what the host itself recorded: made when it is asked for, at whatever rate, of what is evidence already."""
+        return self.path / HOST_TABLE
 
     @property
     def bundle(self) -> Path:

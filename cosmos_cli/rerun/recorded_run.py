@@ -121,7 +121,7 @@ def read_recorded_run(run: RunDirectory, given: str, as_recorded: Path | None) -
     for name in names:
         try:
             agents[name] = (
-                _in_lockstep(config, cut_s)
+                _in_lockstep(run, config, cut_s)
                 if config.time.is_lockstep
                 else _read_agent(run.path / "agents" / name, config, is_killed=name in killed)
             )
@@ -176,10 +176,12 @@ def _cut_s(run: RunDirectory, config: RunConfig) -> float | None:
     return RecordedRun(document=document, tables=tables, config=config).end_s
 
 
-def _in_lockstep(config: RunConfig, cut_s: float | None) -> RecordedAgent:
+def _in_lockstep(run: RunDirectory, config: RunConfig, cut_s: float | None) -> RecordedAgent:
     """Return an agent whose ticks were on time; of a run that was cut off up to the last that was surely whole, and answered."""
     tick_hz = config.agents.tick_hz
-    ticks = count_ticks(config.time.duration_s, tick_hz)
+    document = run.read_json(run.run_json) or {}
+    duration_s = RecordedRun(document=document, tables={}, config=config).duration_s
+    ticks = max(count_ticks(duration_s, tick_hz), 1)
     if cut_s is not None:
         ticks = max(min(ticks, math.floor(cut_s * tick_hz) - 1), 1)
     last_s = (ticks - 1) / tick_hz

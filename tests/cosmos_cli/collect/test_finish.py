@@ -738,6 +738,20 @@ def test_input_that_was_deleted_is_named_and_limits_stay(tmp_path, name):
 
 
 @pytest.mark.slow
+def test_the_hosts_table_is_no_evidence_that_changes_when_it_is_made_anew_or_deleted(tmp_path):
+    made = SyntheticRun(tmp_path, make_config(1, ticks=20)).write()
+    finish(made)
+    made.run.host_table.write_bytes(b"at 1 Hz")
+    assert again(made).exit_code == 0
+    assert made.run.host_table.name in read(made.run.manifest_json)["files"]
+
+    made.run.host_table.write_bytes(b"at 10 Hz")
+    assert again(made).missing == ()
+    made.run.host_table.unlink()
+    assert again(made).missing == ()
+
+
+@pytest.mark.slow
 def test_stream_that_was_shortened_and_closed_again_is_named_every_time(tmp_path):
     made = SyntheticRun(tmp_path).write()
     finish(made)

@@ -256,3 +256,15 @@ def test_a_run_in_lockstep_that_failed_by_itself_fails_again(tmp_path):
     finish_run(made.run, result, made.expected, has_report=False)
 
     assert read_recorded_run(made.run, "last", None).cut_s is None
+
+
+def test_the_last_tick_of_a_run_in_lockstep_that_was_stopped_is_the_one_before_the_stop(tmp_path):
+    config = make_config(1)
+    config = dataclasses.replace(config, time=dataclasses.replace(config.time, mode="lockstep"))
+    made = SyntheticRun(tmp_path, config)
+    made.write_agent("agent-01", last=120)
+    finish_run(made.run, made.result(duration_s=12.0), made.expected, has_report=False)
+
+    recorded = read_recorded_run(made.run, "last", None)
+
+    assert (recorded.cut_s, recorded.agents["agent-01"].last_s) == (None, pytest.approx(11.9))
