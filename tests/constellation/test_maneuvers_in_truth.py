@@ -12,6 +12,7 @@ from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.protocol.messages import Service
 from madns_runtime.simulations.constellation.host_side.truth_distribution import URGENT_KNOTS_MAX
 from madns_runtime.simulations.constellation.messages import Command
+from madns_runtime.simulations.constellation.orbit.quaternions import rotate_back
 
 SCRIPT = '''
 from madns_runtime.simulations.constellation.flight.api import FlightSoftware
@@ -510,6 +511,27 @@ def test_rigid_bodies_are_turned_by_torques_and_pushed_along_their_axes(fly):
     rows, still = state_rows(star, "agent-02"), state_rows(coasting(), "agent-02")
     push = (rows[125, 4:] - still[125, 4:]) @ rows[125, 1:4] / np.linalg.norm(rows[125, 1:4])
     assert push == pytest.approx(-1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("is_lockstep", [False, True])
+def test_a_turn_that_is_commanded_after_a_burn_to_come_turns_the_burn_too(fly, is_lockstep):
+    star = fly(
+        ["agent-02 50 body 15 1 0 0", "agent-02 100 torque 6 0 0 1 2"],  # thrust from 15 s to 25 s
+        vehicle={
+            "thruster": THRUSTER | {"thrust_n": 10.0},
+            "attitude": {"inertia_kg_m2": [10.0, 10.0, 10.0]},
+        },
+        count=2,
+        star={"is_lockstep": is_lockstep},
+    )
+
+    star.run(60.0)
+
+    q = star.contexts["agent-02"].records["attitude"][200][1:5]
+    rows, still = state_rows(star, "agent-02"), state_rows(coasting(), "agent-02")
+    gained = rows[255, 4:] - still[255, 4:]
+    assert gained / np.linalg.norm(gained) == pytest.approx(rotate_back(q, (1, 0, 0)), abs=2e-3)
+    assert star.underruns() == 0
 
 
 def test_truth_in_parts_is_the_same_for_any_number_of_workers(fly):

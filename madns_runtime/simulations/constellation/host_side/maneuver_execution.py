@@ -123,8 +123,7 @@ class Maneuvering:
 
     def _carry_out(self, taken: Taken, *, is_urgent: bool) -> None:
         """Have truth changed by the executor, or here and now if time is short, and tell flight software then."""
-        assert taken.effect is not None
-        vehicle, start_s = taken.vehicle, taken.effect.start_s
+        vehicle, start_s = taken.vehicle, self._changed_from(taken)
         due_s = start_s + taken.command.phase_s
         if is_urgent or due_s - self._context.now_s() < URGENT_S:
             # In lockstep nobody waits: there truth comes in one, and to the same digits as ever.
@@ -138,6 +137,13 @@ class Maneuvering:
         else:
             heapq.heappush(self._waiting, (due_s - OVERTAKEN_S, job, taken))
             self._context.wake(due_s - OVERTAKEN_S)
+
+    def _changed_from(self, taken: Taken) -> float:
+        """Return from when truth is another one by a command that was taken."""
+        assert taken.effect is not None
+        allowed = self._context.parameters.maneuvers
+        ready_s = taken.heard_s + allowed.propagation_s + allowed.network_s - taken.command.phase_s
+        return self._supply.store.timelines[taken.vehicle].changed_from(taken.effect, ready_s)
 
     def _came(self, taken: Taken, is_current: bool) -> None:
         """Take that the executor is done with a command."""
@@ -153,7 +159,7 @@ class Maneuvering:
         Truth that is not changed yet holds the command as soon as it is known so far.
         """
         assert taken.effect is not None
-        vehicle, start_s, phase_s = taken.vehicle, taken.effect.start_s, taken.command.phase_s
+        vehicle, start_s, phase_s = taken.vehicle, self._changed_from(taken), taken.command.phase_s
         if is_changed:
             if taken.effect.kind in ("impulse", "thrust"):
                 # It may be flown before a burn by whose end energy is compared already.

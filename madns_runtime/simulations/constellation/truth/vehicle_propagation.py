@@ -22,6 +22,7 @@ from madns_runtime.errors import ConfigurationError
 from madns_runtime.simulations.constellation.orbit.frames import vector_to_inertial
 from madns_runtime.simulations.constellation.thrust import Thrust, Vector
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
+    TURNING,
     Effect,
     KnotSpan,
     Piece,
@@ -45,8 +46,6 @@ Array = NDArray[np.float64]
 ROUNDING_S = 1e-9
 """Knots nearer to each other than this are the same, computed on two ways."""
 COASTING: Vector = (0.0, 0.0, 0.0)
-TURNING = ("torque", "dipole")
-"""Effects that turn a body while they act."""
 THRUST_LEG_S = 10.0
 """Most of a thrust arc that is propagated in one call."""
 

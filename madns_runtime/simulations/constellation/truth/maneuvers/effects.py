@@ -24,6 +24,8 @@ from madns_runtime.simulations.constellation.thrust import Thrust, Vector
 
 EffectKind = Literal["impulse", "thrust", "torque", "ballistic", "dipole"]
 
+TURNING: tuple[EffectKind, EffectKind] = ("torque", "dipole")
+"""Effects that turn a body while they act."""
 SNAP_S = 1e-7
 """A time this near to a knot is the knot's: 0.2 mm at 2 km/s."""
 SHORT = 0.1
@@ -107,6 +109,26 @@ class Timeline:
         middles_s = (e.at_s for e in later if e.kind == "thrust" and e.start_s <= t1_s)
         until_s = max(middles_s, default=t1_s)  # where the arc's axes are taken
         return tuple(e for e in later if e.start_s <= max(t1_s, until_s))
+
+    def changed_from(self, effect: Effect, ready_s: float) -> float:
+        """
+        Return from when an effect makes truth another one.
+
+        That is its beginning, or that of a burn in body axes that begins before it and is yet to come: at its middle the
+        axes are other ones now.
+
+        Args:
+            effect: One of them.
+            ready_s: From when on truth can be changed.
+        """
+        burns_s = (
+            each.start_s
+            for each in self.effects
+            if each.kind == "thrust"
+            and each.frame == "body"
+            and ready_s <= each.start_s < effect.start_s < each.at_s
+        )
+        return min(burns_s, default=effect.start_s) if effect.kind in TURNING else effect.start_s
 
     def ballistic_at(self, t_s: float) -> float:
         """Return the ballistic coefficient from *t_s* on, m^2/kg."""
