@@ -60,7 +60,7 @@ class Fault:
     override: str = ""
     """KEY when the value came from --set KEY=VALUE."""
     option: str = ""
-    """What was typed instead of that --set, such as --duration."""
+    """The option that was typed instead of that --set, such as --duration."""
 
     def render(self) -> str:
         """
