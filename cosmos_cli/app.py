@@ -43,6 +43,7 @@ OF_LINES = ("logs",)
 """Commands whose --json is one object per line, an error's as well."""
 CLICK_ERROR: Any = USAGE_ERROR.__mro__[1]
 """Base of all errors of usage."""
+HERE_GONE = "the current folder is gone: it was deleted; change to another one with cd"
 
 
 def make_app() -> typer.Typer:
@@ -111,9 +112,12 @@ def run(arguments: list[str]) -> int:
         )
         return _flushed(int(code) if isinstance(code, int) else int(ExitCode.OK))
     except (CosmosError, MadnsError) as error:
+        description = describe(error)
+        is_lost = description["exit_code"] == ExitCode.BAD_INPUT and _is_here_gone()
+        text = _with_arguments_in_one_line(str(error), arguments)
         return _report(
-            describe(error),
-            _with_arguments_in_one_line(str(error), arguments),
+            description,
+            f"{text}\n{HERE_GONE}" if is_lost else text,
             _wants_json(arguments),
             bare=bool(isinstance(error, InputError) and error.faults),
         )
@@ -201,8 +205,8 @@ def _report_unexpected(error: Exception, wants_json: bool) -> int:
         text = f"{error.strerror}: `ulimit -n` is {limit}: raise it, or end programs that hold many open"
         return _report(_plain("descriptors", text, int(ExitCode.MACHINES)), text, wants_json)
     if isinstance(error, FileNotFoundError) and _is_here_gone():
-        text = "the current folder is gone: it was deleted; change to another one with cd"
-        return _report(_plain(InputError.kind, text, ExitCode.BAD_INPUT), text, wants_json)
+        told = _plain(InputError.kind, HERE_GONE, ExitCode.BAD_INPUT)
+        return _report(told, HERE_GONE, wants_json)
     if isinstance(error, RuntimeError) and _has_no_home():
         text = "no home folder is known of this user: set HOME to a folder of yours"
         return _report(_plain(InputError.kind, text, ExitCode.BAD_INPUT), text, wants_json)

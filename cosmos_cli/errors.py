@@ -60,7 +60,7 @@ class Fault:
     override: str = ""
     """KEY when the value came from --set KEY=VALUE."""
     option: str = ""
-    """What was typed instead of that --set, such as --duration."""
+    """The option that was typed instead of that --set, such as --duration."""
 
     def render(self) -> str:
         """
@@ -164,6 +164,11 @@ class InputError(CosmosError):
             lines.append(f"and {self.omitted} more fault{'' if self.omitted == 1 else 's'}")
         super().__init__(message or "\n".join(lines))
 
+    @property
+    def all_faults(self) -> tuple[Fault, ...]:
+        """The faults, or the message as one: who collects those of many files must lose none."""
+        return self.faults or (Fault(text=str(self)),)
+
     def details(self) -> Mapping[str, Any]:
         """Return the faults."""
         return {
@@ -183,7 +188,8 @@ def check_path_is_text(path: Path) -> None:
     try:
         real.encode()
     except UnicodeEncodeError:
-        raise InputError(f"{real}: expected a path in UTF-8; rename the folder or file") from None
+        text = "expected a path in UTF-8; rename the folder or file"
+        raise InputError(faults=[Fault(text=text, file=real)]) from None
 
 
 class MachinesError(CosmosError):

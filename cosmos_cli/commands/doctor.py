@@ -42,6 +42,7 @@ from cosmos_cli.models.inventory.devices import driven_devices
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.ui import invocation
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.plural import counted
 from madns_runtime.processes import state_directory
@@ -94,7 +95,11 @@ def doctor(
     console.say(f"measuring {_who(examination.wants.machines)}, some seconds each")
     outcomes = examination.outcomes()
     wants = examination.wants
-    findings = {o.machine: judge(Case.of(o.machine, o.value, wants)) for o in outcomes if o.value}
+    findings = {
+        o.machine: with_machines(judge(Case.of(o.machine, o.value, wants)))
+        for o in outcomes
+        if o.value
+    }
     told = [finding for machine in findings.values() for finding in machine]
     _show(console, told, outcomes, is_all=all_)
     exit_code = _exit_code(told, outcomes, is_strict=strict)
@@ -125,6 +130,20 @@ def doctor(
         }
     )
     return int(exit_code)
+
+
+def with_machines(findings: Sequence[Finding]) -> list[Finding]:
+    """Return findings whose cures name the inventory that was given: the checks know of none."""
+    options = invocation.current().machine_options
+    return [
+        dataclasses.replace(
+            each,
+            remark=dataclasses.replace(
+                each.remark, cure=each.remark.cure.replace(" -i INVENTORY", options)
+            ),
+        )
+        for each in findings
+    ]
 
 
 class _Examination:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,7 @@ from cosmos_cli.commands.fleet_command import (
     some_machines,
 )
 from cosmos_cli.commands.run_arguments import RunsOption
-from cosmos_cli.errors import InputError
+from cosmos_cli.errors import CosmosError, InputError
 from cosmos_cli.evidence.run_directory import runs_root, utc_now
 from cosmos_cli.fleet.connection import ConnectOptions
 from cosmos_cli.launch.access import chosen_access
@@ -28,9 +29,16 @@ from cosmos_cli.launch.execute import Detached, RunOptions, execute, plan_of
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.models.overrides import told_as_options
 from cosmos_cli.system.import_turn import IMPORT_TURN
-from cosmos_cli.testing.junit import JunitOption, check_junit, junit_case_of, write_junit
+from cosmos_cli.testing.junit import (
+    JunitCase,
+    JunitOption,
+    check_junit,
+    junit_case_of,
+    write_junit,
+)
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption, losing_output
 from cosmos_cli.view.factory import make_view
+from madns_runtime.errors import MadnsError
 
 
 def run(
@@ -100,7 +108,14 @@ def run(
 def _run(console: Console, checked: ScenarioFile, options: RunOptions, junit: Path | None) -> None:
     """Run, and end with the verdict; or without, where the run goes on by itself."""
     started_utc, started_s = utc_now(), time.monotonic()
-    summary = execute(checked, options, partial(make_view, quiet=console.quiet), console.say)
+    try:
+        summary = execute(checked, options, partial(make_view, quiet=console.quiet), console.say)
+    except (CosmosError, MadnsError) as error:
+        if junit is not None:
+            # A file of an earlier run would tell of this one that it passed.
+            with contextlib.suppress(InputError):
+                _write_failure(junit, checked, str(error), started_s, started_utc)
+        raise
     say = console.say if console.json else console.data
     if isinstance(summary, Detached):
         console.print_json(summary.to_mapping())
@@ -117,6 +132,21 @@ def _run(console: Console, checked: ScenarioFile, options: RunOptions, junit: Pa
             console.print_json(dict(summary.document))
             say(summary.last_line)
     raise typer.Exit(int(summary.exit_code))
+
+
+def _write_failure(
+    junit: Path, checked: ScenarioFile, why: str, started_s: float, started_utc: str
+) -> None:
+    """Write JUnit XML of a run that came to no verdict."""
+    case = JunitCase(
+        classname=str(checked.path),
+        name=checked.scenario.name,
+        seconds=time.monotonic() - started_s,
+        failure=why.partition("\n")[0],
+        details=why,
+        properties=(("seed", str(checked.scenario.seed)),),
+    )
+    write_junit(junit, [case], seconds=case.seconds, started_utc=started_utc)
 
 
 def _check(

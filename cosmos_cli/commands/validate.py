@@ -45,7 +45,7 @@ def validate(
             scenario_file = load_scenario(path, set_ or (), warn=console.warn)
             check_test(scenario_file, console.warn)
         except InputError as error:
-            faults += error.faults
+            faults += error.all_faults
             omitted += error.omitted
         else:
             found.append(scenario_file)

@@ -25,7 +25,7 @@ def living(case: Case) -> Iterator[CheckRemark]:
         yield CheckRemark(
             level=Severity.WARNING,
             found=f"processes of a dead run: {_shown(left)}",
-            cure=f"`cosmos down {left[0]}`" + ("" if case.is_here else " -i INVENTORY"),
+            cure=f"`cosmos down {left[0]}{'' if case.is_here else ' -i INVENTORY'}`",
         )
     if alive:
         yield CheckRemark(

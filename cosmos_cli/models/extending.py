@@ -96,8 +96,10 @@ def _chain(path: Path) -> list[_File]:
         try:
             chain.append(_read(label, target))
         except InputError as error:
-            whole = [fault for fault in error.faults if fault.line is None]
-            told = [last.fault("extends", f"{f.file}: {f.text}") for f in whole]
+            whole = [fault for fault in error.all_faults if fault.line is None]
+            told = [
+                last.fault("extends", f"{f.file}: {f.text}" if f.file else f.text) for f in whole
+            ]
             told += [fault for fault in error.faults if fault.line is not None]
             raise InputError(faults=[*faults, *told], omitted=error.omitted) from None
     return chain

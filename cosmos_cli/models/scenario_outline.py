@@ -66,7 +66,7 @@ class ScenarioOutline:
         except InputError as error:
             own = dict(zip(self.settings, self._own(), strict=True))
             applied = {key for key, override in own.items() if override in overrides}
-            faults = [self._placed(fault, applied) for fault in error.faults]
+            faults = [self._placed(fault, applied) for fault in error.all_faults]
             raise InputError(faults=faults, omitted=error.omitted) from error
 
     def baseline(self) -> Baseline | None:
@@ -157,7 +157,7 @@ def check_test(scenario: ScenarioFile, warn: Callable[[str], None]) -> None:
         try:
             look()
         except InputError as error:
-            faults += map(_of_the_test, error.faults)
+            faults += map(_of_the_test, error.all_faults)
             omitted += error.omitted
     if faults:
         faults.sort(key=lambda fault: (bool(fault.override), fault.line or 0, fault.column or 0))

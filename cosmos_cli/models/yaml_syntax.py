@@ -1,4 +1,4 @@
-"""What the YAML parser's errors mean, in plain words, and where what is meant stands. Pure."""
+"""Meanings of the errors of the YAML parser in plain words, and where what is meant stands. Pure."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def carried_over(recorded: FlownRun) -> CarriedOver:
     try:
         document = read_document(read_source(path))
     except InputError as error:
-        found.remarks.append(f"no checks and no timeline: {clean_line(error.faults[0].text)}")
+        found.remarks.append(f"no checks and no timeline: {clean_line(error.all_faults[0].text)}")
         return found
     substitute_variables(document)
     found.timeline = _items(document.value, "timeline")

@@ -100,7 +100,7 @@ def _add(found: FoundScenarios, file: Path, *, is_named: bool) -> None:
         found.outlines.append(read_outline(file))
     except InputError as error:
         if is_named or _seems_scenario(file):
-            found.faults += error.faults or (Fault(text=str(error)),)
+            found.faults += error.all_faults
         else:
             found.others.append(file)
 
@@ -153,9 +153,8 @@ def choose_cases(
         try:
             chosen.cases += make_cases(outline, settings, meant, warn) if meant else []
         except InputError as error:
-            faults += error.faults
+            faults += error.all_faults
             omitted += error.omitted
-            messages += [] if error.faults else [str(error)]
         except MissingExtraError as error:
             messages.append(f"{outline.path}: {error}")
         if len(chosen.cases) > CASES_MAX:

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import typer
 
-from cosmos_cli.errors import InputError
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.testing.check_lines import broken_checks, check_line
 from cosmos_cli.ui.foreign_text import clean_line, clean_text
 from madns_runtime.partial_file import check_replaceable, write_whole
@@ -153,7 +153,9 @@ def junit_case_of(path: Path, directory: Path, document: Mapping[str, Any]) -> J
         document: Its run.json.
     """
     verdict = str(document.get("verdict") or "no verdict")
-    is_failed = document.get("exit_code") != 0
+    code = document.get("exit_code")
+    is_cut = code == int(ExitCode.INTERRUPTED)
+    is_failed = code != 0 and not is_cut
     broken = [check_line(check) for check in broken_checks(document)]
     return JunitCase(
         classname=str(path),
@@ -161,5 +163,6 @@ def junit_case_of(path: Path, directory: Path, document: Mapping[str, Any]) -> J
         seconds=0.0,
         failure=verdict if is_failed else "",
         details="\n".join([verdict, *broken, f"its run: {directory}"]),
+        skipped="interrupted" if is_cut else "",
         properties=(("seed", str(document.get("seed"))), ("run", str(directory))),
     )

@@ -7,7 +7,7 @@ from typing import Final
 KILO: Final = 1000.0
 UNITS: Final = ("kB", "MB", "GB", "TB")
 ROUNDED_UP: Final = 999.95
-"""What one decimal would show as 1000.0 is told in the next unit."""
+"""A size that one decimal would show as 1000.0 is told in the next unit."""
 
 
 def size_words(size_bytes: float) -> str:

@@ -66,7 +66,7 @@ class Reader:
         try:
             yield
         except InputError as error:
-            self.faults += error.faults
+            self.faults += error.all_faults
             self.omitted += error.omitted
 
     def read(self, document: Document) -> None:

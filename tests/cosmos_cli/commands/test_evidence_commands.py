@@ -412,7 +412,10 @@ def test_records_of_a_newer_program_are_named_and_make_a_run_incomplete(made, ca
     )
 
 
-@pytest.mark.parametrize("arguments", [["report", "1"], ["runs"], ["runs", "--json"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["report", "1"], ["runs"], ["runs", "--json"], ["init", "x"], ["test"]],
+)
 def test_current_folder_that_was_deleted_is_told_as_such(tmp_path, monkeypatch, capsys, arguments):
     monkeypatch.delenv("COSMOS_RUNS", raising=False)
     gone = tmp_path / "gone"

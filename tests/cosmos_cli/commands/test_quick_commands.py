@@ -53,6 +53,27 @@ def test_validate_says_what_was_found(cosmos):
     )
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("validate", "\udcff.yaml"),
+        ("validate", "a.yaml", "\udcff.yaml"),
+        ("validate", "below.yaml"),
+        ("inventory", "-i", "pi01,", "-i", "\udcff.yaml"),
+        ("test", "\udcff.yaml"),
+    ],
+)
+def test_file_whose_path_is_no_text_is_refused_and_never_left_out(cosmos, words):
+    Path("\udcff.yaml").write_text(SCENARIO)
+    Path("below.yaml").write_text("extends: link.yaml\n")
+    Path("link.yaml").symlink_to("\udcff.yaml")
+
+    code, _, err = cosmos(*words)
+
+    assert code == ExitCode.BAD_INPUT
+    assert "expected a path in UTF-8; rename the folder or file" in err
+
+
 @pytest.mark.parametrize("words", [(), ("--resolved",)])
 def test_validate_keeps_a_file_with_a_line_end_in_its_name_on_one_line(cosmos, words):
     Path("a\nb.yaml: ok.yaml").write_text(SCENARIO)

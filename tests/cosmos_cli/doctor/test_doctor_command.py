@@ -11,13 +11,35 @@ from typing import Any
 import pytest
 
 from cosmos_cli.app import run as cosmos
-from cosmos_cli.doctor.finding import HERE
+from cosmos_cli.commands.doctor import with_machines
+from cosmos_cli.doctor.finding import HERE, CheckRemark, Finding
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.local import LocalConnection
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.ui import invocation
+from cosmos_cli.ui.invocation import Invocation
 
 pytestmark = pytest.mark.process
+
+
+@pytest.mark.parametrize(
+    ("words", "cure"),
+    [
+        (("-i", "my box.yaml"), "`cosmos up -i 'my box.yaml'`, then reboot"),
+        ((), "`cosmos up -i INVENTORY`, then reboot"),
+    ],
+)
+def test_cure_names_the_inventory_that_was_given(monkeypatch, words, cure):
+    monkeypatch.delenv("COSMOS_INVENTORY", raising=False)
+    given = Invocation(verb="doctor", words=words, valued=frozenset({"-i"}))
+    monkeypatch.setattr(invocation, "current", lambda: given)
+    remark = CheckRemark(found="no package x", cure="`cosmos up -i INVENTORY`, then reboot")
+
+    (finding,) = with_machines([Finding(machine="pi01", check="devices", remark=remark)])
+
+    assert finding.remark.cure == cure
+
 
 SCENARIO = """\
 name: two

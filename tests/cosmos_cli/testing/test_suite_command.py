@@ -15,6 +15,8 @@ from lxml import etree
 from suite_cases import make_result
 
 from cosmos_cli.app import run as run_here
+from cosmos_cli.errors import MachinesError
+from cosmos_cli.testing.junit import junit_case_of, junit_text
 from cosmos_cli.testing.outcome import judge_case
 from cosmos_cli.testing.suite import SuiteResult
 from madns_runtime.processes import list_processes
@@ -309,6 +311,33 @@ def test_json_stays_one_document_though_junit_xml_cannot_be_written_at_the_end(
     document = json.loads(said.out)
     assert (code, document["failed"], document["exit_code"]) == (2, 1, 2)
     assert "out/j.xml: cannot be written: " in said.err
+
+
+def test_a_run_without_a_verdict_takes_the_place_of_an_earlier_one_in_junit_xml(
+    cosmos, monkeypatch, capsys
+):
+    def fail(*_):
+        raise MachinesError("pi01 (10.0.0.1): no answer\npi02 (10.0.0.2): no answer")
+
+    path, junit = scenario(cosmos, "s"), cosmos.folder / "j.xml"
+    junit.write_text("<testsuites/>")
+    monkeypatch.setattr("cosmos_cli.commands.run.execute", fail)
+    monkeypatch.setenv("COSMOS_RUNS", str(cosmos.runs))
+    code = run_here(["run", str(path), "--junit", str(junit)])
+
+    assert (code, "pi02 (10.0.0.2): no answer" in capsys.readouterr().err) == (3, True)
+    SCHEMA.assertValid(etree.parse(junit))
+    (failure,) = etree.parse(junit).iter("failure")
+    assert failure.get("message") == "pi01 (10.0.0.1): no answer"
+    assert "pi02 (10.0.0.2): no answer" in failure.text
+
+
+@pytest.mark.parametrize(("code", "word"), [(130, "skipped"), (4, "failure"), (None, "failure")])
+def test_a_run_that_was_interrupted_is_skipped_in_junit_xml_as_a_test_is(code, word):
+    case = junit_case_of(Path("s.yaml"), Path("runs/1"), {"exit_code": code, "verdict": "told"})
+    root = etree.fromstring(junit_text([case], seconds=1.0, started_utc="2026-01-01T00:00:00Z"))
+
+    assert [each.tag for each in root[0][0] if each.tag != "properties"] == [word]
 
 
 def test_a_run_by_itself_writes_junit_xml_too(cosmos):
