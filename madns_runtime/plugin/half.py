@@ -249,7 +249,7 @@ class HostHalf(Half):
 
     @property
     def doing(self) -> str:
-        """What is called, or was called last."""
+        """Method that is called, or was called last."""
         return self._calls.method
 
     def set_up(self, context: Any) -> None:

@@ -57,7 +57,7 @@ class HostCalls:
         self.name = ""
         """Of the half: what precedes a method's name."""
         self.method = ""
-        """What is called, or was called last."""
+        """Method that is called, or was called last."""
         self.t_s: Callable[[], float | None] = lambda: None
         """Returns the simulated time, s; None before it runs."""
         self.is_counting = False
