@@ -156,7 +156,7 @@ class LockstepHalf:
         self._faults = self._half.carrier.faults = faults
 
     def _guard(self, name: str, call: Callable[[], Any], limit_s: float | None = None) -> Any:
-        self._under_way = (f"{self._half.name}.{name}", limit_s or self._timeouts.tick_s)
+        self._under_way = (name, limit_s or self._timeouts.tick_s)
         try:
             return call()
         except HalfFailed as failure:
@@ -199,7 +199,9 @@ class LockstepHalf:
                 watched, limit = present, GrantedLimit(present[1] if present else 0.0)
             elif present is not None and limit.is_over():
                 faulthandler.dump_traceback(file=sys.__stderr__ or 2)
-                call, limit_s = present
+                name, limit_s = present
+                # Within a call others are made, such as the medium's.
+                call = f"{self._half.name}.{self._half.doing or name}"
                 when = self._barrier.when()
                 self._on_hang(f"{call} has not returned within {limit_s:g} s{when}; {STACK_HINT}")
                 os._exit(1)

@@ -247,6 +247,11 @@ class HostHalf(Half):
         self._calls.end("__init__", began_s)
         self._receive = self._method("receive")
 
+    @property
+    def doing(self) -> str:
+        """Method that is called, or was called last."""
+        return self._calls.method
+
     def set_up(self, context: Any) -> None:
         """
         Have it prepare, and make the medium of messages between agents.

@@ -56,6 +56,8 @@ class HostCalls:
     def __init__(self, session_hex: str = "") -> None:
         self.name = ""
         """Name of the half, which precedes a method's name."""
+        self.method = ""
+        """Method that is called, or was called last."""
         self.t_s: Callable[[], float | None] = lambda: None
         """Returns the simulated time, s; None before it runs."""
         self.is_counting = False
@@ -76,6 +78,7 @@ class HostCalls:
     def begin(self, method: str) -> float:
         """Note that *method* is called now, and return the computer's time, s, where that counts."""
         line = self._lines.get(method) or self._make_line(method)
+        self.method = method
         t_s = self.t_s()
         self._page[:] = line % (math.nan if t_s is None else t_s)
         return monotonic() if self.is_counting else 0.0

@@ -116,6 +116,9 @@ def resolve(spec: str, base_directory: Path) -> Simulation:
     return _checked(descriptor, where, module)
 
 
+BEGIN_ACTION = "begin_action"
+
+
 def load_half(descriptor: Simulation, role: Role, base_directory: Path) -> Callable[[], Any]:
     """
     Import one half of a simulation and return its class, made without arguments.
@@ -125,11 +128,17 @@ def load_half(descriptor: Simulation, role: Role, base_directory: Path) -> Calla
         MissingExtraError: It needs an optional dependency that is not installed.
     """
     where = descriptor.host if role == "host" else descriptor.agent
+    words = ", ".join(each.word for each in descriptor.actions if each.carried_out_by == role)
+    if where is None and words:
+        raise PluginError(f"host: expected a class that carries out {words}, got None")
     if where is None:
         return IdleHost
     half: Callable[[], Any]
     _, half = load_object(where, base_directory)
     faults = _contract_faults(half, role)
+    inherited = (None, getattr(CONTRACTS[role][0], BEGIN_ACTION))
+    if words and getattr(half, BEGIN_ACTION, None) in inherited:
+        faults.append(f"no method {BEGIN_ACTION}() of its own, to carry out {words}")
     if faults:
         raise PluginError(f"{told_place(where, half)}: {'; '.join(faults)}")
     return half

@@ -21,7 +21,7 @@ def test_every_key_and_every_statistic_has_a_row():
     section = GUIDE.split("## What comes of them")[0]
     told = set(re.findall(r"`(\w+)", "\n".join(re.findall(r"^\|([^|]*)\|", section, flags=re.M))))
 
-    assert {written_name(name) for name in field_names(CheckRule)} | set(
+    assert {written_name(CheckRule, name) for name in field_names(CheckRule)} | set(
         get_args(Statistic)
     ) <= told
 

@@ -552,6 +552,25 @@ def test_an_outcome_that_cannot_be_told_is_the_mediums_fault(logged, answer, wor
         half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
 
 
+def test_what_hangs_within_a_call_is_known_by_its_own_name(logged):
+    seen = []
+
+    class Watched(Air):
+        def carry(self, sender, transmission):
+            seen.append(half.doing)
+            return super().carry(sender, transmission)
+
+    def medium(host, context):
+        seen.append(half.doing)
+        return Watched([LinkOutcome(to="b", outcome="lost")])
+
+    half = made(Base, logged, HostHalf, medium)
+    half.set_up(None)
+    half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
+
+    assert seen == ["medium", "medium.carry"]
+
+
 def test_what_a_reach_raises_is_told_with_its_own_line(logged):
     def reach(sender: str, receiver: str, t_s: float) -> str:
         raise ValueError("no map")

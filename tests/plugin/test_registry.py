@@ -10,7 +10,13 @@ import pytest
 from madns_runtime.errors import ConfigurationError, MissingExtraError, PluginError
 from madns_runtime.hardware import kind_registry
 from madns_runtime.plugin import registry, time_limit
-from madns_runtime.plugin.api import Simulation
+from madns_runtime.plugin.api import ActionKind, Simulation
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Brake:
+    """Parameters of an action."""
+
 
 PLUGIN = """
     from __future__ import annotations
@@ -328,6 +334,34 @@ def test_method_that_a_run_may_call_late_or_never_is_looked_at_like_any_other(wr
         "abandon() must take (self)",
     ):
         assert wanted in message
+
+
+@pytest.mark.parametrize(
+    ("body", "is_refused"),
+    [
+        ("class Agent(AgentSimulation): pass", True),
+        ("class Agent(AgentSimulation):\n    def begin_actions(self, action): pass", True),
+        ("class Agent(AgentSimulation):\n    def begin_action(self, action): pass", False),
+    ],
+)
+def test_a_half_that_carries_out_declared_actions_has_the_method(write, tmp_path, body, is_refused):
+    write(PLUGIN + textwrap.indent(body, "    "))
+    descriptor = registry.resolve("./plugin.py:simulation", tmp_path)
+    brake = ActionKind(
+        word="brake", summary="Brakes.", parameters=Brake, lasting="never", carried_out_by="agent"
+    )
+    acting = dataclasses.replace(descriptor, actions=(brake,))
+
+    registry.load_half(descriptor, "agent", tmp_path)
+    if not is_refused:
+        registry.load_half(acting, "agent", tmp_path)
+        return
+    with pytest.raises(PluginError, match=r"no method begin_action\(\) of its own, .*out brake"):
+        registry.load_half(acting, "agent", tmp_path)
+    of_host = dataclasses.replace(brake, carried_out_by="host")
+    idle = dataclasses.replace(acting, host=None, actions=(of_host,))
+    with pytest.raises(PluginError, match=r"host: expected a class that carries out brake, got"):
+        registry.load_half(idle, "host", tmp_path)
 
 
 def test_method_with_other_parameters_is_refused(write, tmp_path):

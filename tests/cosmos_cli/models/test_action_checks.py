@@ -17,7 +17,7 @@ class Parameters:
 class Jam:
     door: str
 class Agent(AgentSimulation):
-    pass
+    def begin_action(self, action): pass
 JAM = ActionKind(word="jam", summary="Jams a door.", parameters=Jam, carried_out_by="agent")
 simulation = Simulation(
     name="doors", parameters=Parameters, agent=":Agent", actions=(JAM,), check_actions=":check_actions"

@@ -432,9 +432,10 @@ def test_a_field_whose_name_ends_with_an_underscore_is_written_as_it_is_called(t
         "from madns_runtime.plugin.api import ActionKind, AgentSimulation, Simulation\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Wave:\n    lambda_: float = 2.0\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Waves:\n    wave: Wave = Wave()\n"
-        "class Agent(AgentSimulation):\n    pass\n"
-        "simulation = Simulation(name='w', parameters=Waves, agent=':Agent',\n"
-        "    actions=(ActionKind(word='dim', summary='Dims.', parameters=Wave, lasting='never'),))\n"
+        "class Agent(AgentSimulation):\n    def begin_action(self, action):\n        pass\n"
+        "DIM = ActionKind(\n"
+        "    word='dim', summary='Dims.', parameters=Wave, lasting='never', carried_out_by='agent')\n"
+        "simulation = Simulation(name='w', parameters=Waves, agent=':Agent', actions=(DIM,))\n"
     )
     (tmp_path / "a.yaml").write_text(
         "name: a\nsimulation: ./waves.py:simulation\nagents: {count: 1}\ntime: {duration_s: 2}\n"

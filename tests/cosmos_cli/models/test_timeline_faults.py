@@ -287,7 +287,7 @@ def test_no_action_has_a_parameter_that_a_timelines_entry_has_itself() -> None:
 VALVES = """
 from dataclasses import dataclass, field
 from typing import Any
-from madns_runtime.plugin.api import ActionKind, AgentSimulation, Simulation
+from madns_runtime.plugin.api import ActionKind, AgentSimulation, HostSimulation, Simulation
 
 @dataclass(frozen=True)
 class Parameters:
@@ -299,7 +299,13 @@ class Valve:
     FIELD
 
 VALVE = ActionKind(word="open_valve", summary="Opens.", parameters=Valve, takes_agents=False)
-simulation = Simulation(name="tanks", parameters=Parameters, agent=":Tank", actions=(VALVE,))
+simulation = Simulation(
+    name="tanks", parameters=Parameters, agent=":Tank", host=":Farm", actions=(VALVE,)
+)
+
+class Farm(HostSimulation):
+    def begin_action(self, action):
+        pass
 
 class Tank(AgentSimulation):
     pass
