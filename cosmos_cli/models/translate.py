@@ -162,18 +162,26 @@ def _likeliest(located: Sequence[Located], depth: int = 0) -> Iterator[Located]:
             for errors, distance in zip(group.values(), distances, strict=True)
             if distance == nearest
         ]
-        yield from _alternatives(meant, depth) or _likeliest(meant[0], depth + 1)
+        beside = [errors for errors in meant if _places(errors) == _places(meant[0])]
+        yield from _alternatives(beside, depth) or _likeliest(meant[0], depth + 1)
+
+
+def _places(errors: Sequence[Located]) -> list[Path]:
+    return [item.path for item in errors]
 
 
 def _alternatives(members: Sequence[Sequence[Located]], depth: int) -> list[Located]:
-    """Return errors that name the types of all members, where values are of none of them and nothing else is wrong."""
-    places = {tuple(item.path for item in errors) for errors in members}
+    """
+    Return errors that name the types of all members, where values are of none of them and nothing else is wrong.
+
+    All members have errors at the same places.
+    """
     are_types = all(
         item.error["type"] in _EXPECTED and len(item.branches) == depth + 1
         for errors in members
         for item in errors
     )
-    if len(members) < 2 or len(places) > 1 or not are_types:
+    if len(members) < 2 or not are_types:
         return []
     return [
         Located(items[0].path, (), {**items[0].error, "type": ALTERNATIVES, "ctx": _types(items)})

@@ -100,7 +100,7 @@ def test_a_board_that_is_not_ready_says_up_first(tower: DeviceTower) -> None:
     tried = tower.cosmos("devices", "test", "-i", tower.inventory)
 
     assert tried.returncode == 3
-    assert "run `cosmos up -i INVENTORY` first" in tried.stderr
+    assert f"run `cosmos up -i {tower.inventory}` first" in tried.stderr
 
 
 def test_a_run_uses_the_device_of_a_board(tower: DeviceTower) -> None:
