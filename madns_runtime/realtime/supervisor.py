@@ -103,10 +103,8 @@ class Supervisor:
         self._devices.start()
         agents, size = launch.agents, config.agents.per_process
         self._to_fork = [agents[i : i + size] for i in range(0, len(agents), size)]
-        started = [
-            self._fork(agents, incarnation=launch.first_incarnation(agents))
-            for agents in self._to_fork
-        ]
+        first = launch.first_incarnation
+        started = [self._fork(each, incarnation=first(each)) for each in self._to_fork]
         self._reactor = Reactor()
         self._operator = OperatorLink(
             self._reactor,

@@ -1,5 +1,3 @@
-import re
-
 """What every propagator keeps, whoever computes."""
 
 import math
