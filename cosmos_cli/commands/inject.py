@@ -5,11 +5,13 @@ from __future__ import annotations
 import fnmatch
 import json
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+import yaml
 
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
@@ -175,8 +177,8 @@ def _as_yaml(given: str) -> str:
     """Return KEY=VALUE, the value in quotes if it is no YAML, as [ok] done and @home are: it is a text."""
     key, _, text = given.partition("=")
     try:
-        parse_override(f"a={text}")
-    except InputError:
+        deque(yaml.parse(text, Loader=yaml.SafeLoader), maxlen=0)
+    except yaml.YAMLError:
         return f"{key}={json.dumps(text)}"
     return given
 
