@@ -45,35 +45,30 @@ T = TypeVar("T")
 TIMEOUT_S_MAX = 1e6
 """Of any --timeout, eleven days: the kernel's waits end at twenty-four."""
 
+
+def _inventory_option(help_text: str) -> Any:
+    return typer.Option(
+        "--inventory", "-i", metavar="FILE", envvar="COSMOS_INVENTORY", help=help_text
+    )
+
+
 InventoryOption = Annotated[
     list[str],
-    typer.Option(
-        "--inventory",
-        "-i",
-        metavar="FILE",
-        envvar="COSMOS_INVENTORY",
-        help="Inventory: a file, a folder, or machines as in pi01,pi02, (with a comma). Repeatable; the later wins.",
+    _inventory_option(
+        "Inventory: a file, a folder, or machines as in pi01,pi02, (with a comma). Repeatable; the later wins."
     ),
 ]
 SomeInventoryOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--inventory",
-        "-i",
-        metavar="FILE",
-        envvar="COSMOS_INVENTORY",
-        help="Inventory (file, folder, or pi01,pi02, with a comma; repeatable):"
-        " the machines to run on; default: this computer alone.",
+    _inventory_option(
+        "Inventory (file, folder, or pi01,pi02, with a comma; repeatable):"
+        " the machines to run on; default: this computer alone."
     ),
 ]
 PresentInventoryOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--inventory",
-        "-i",
-        metavar="FILE",
-        envvar="COSMOS_INVENTORY",
-        help="Inventory (repeatable) that says where a machine is by now that is not reached where it was in the run.",
+    _inventory_option(
+        "Inventory (repeatable) that says where a machine is by now that is not reached where it was in the run."
     ),
 ]
 HostOption = Annotated[

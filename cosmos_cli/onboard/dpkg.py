@@ -1,9 +1,8 @@
-"""Installed packages of a machine, as dpkg knows them; nothing is changed, and no network is asked."""
+"""Installed packages of a machine, as dpkg knows them; nothing is changed, and no network is asked. Pure."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 TOOL_TIMEOUT_S = 5.0
 APT_CACHE_TIMEOUT_S = 20.0
@@ -16,20 +15,24 @@ DPKG_QUERY = (
 PROVIDES_QUERY = ("dpkg-query", "-W", "-f=${db:Status-Status} ${Package} ${Provides}\\n")
 
 
-def installed_versions(names: Sequence[str]) -> dict[str, str | None]:
+def installed_versions(
+    names: Sequence[str], ask: Callable[[Sequence[str], float], str]
+) -> dict[str, str | None]:
     """
     Tell the installed version of each package; None for one that is not there.
+
+    *ask* runs a program for so many seconds and returns what it prints in English, nothing of one that is not there.
 
     A name that no package has, such as libasound-dev, is there when a package is that provides it, and that is told in
     its place; apt would install nothing for it. One that is also a package's own is not: apt would install that.
     """
-    found: dict[str, str] = versions_of(_said([*DPKG_QUERY, *names])) if names else {}
+    found: dict[str, str] = versions_of(ask([*DPKG_QUERY, *names], TOOL_TIMEOUT_S)) if names else {}
     told: dict[str, str | None] = {name: found.get(name) for name in names}
     missing = [name for name, version in told.items() if version is None and ":" not in name]
-    providers = providers_of(_said(PROVIDES_QUERY)) if missing else {}
+    providers = providers_of(ask(PROVIDES_QUERY, TOOL_TIMEOUT_S)) if missing else {}
     provided = [name for name in missing if name in providers]
     if provided:
-        virtual = virtual_names(_said(["apt-cache", "policy", *provided], APT_CACHE_TIMEOUT_S))
+        virtual = virtual_names(ask(["apt-cache", "policy", *provided], APT_CACHE_TIMEOUT_S))
         told |= {name: providers[name] for name in provided if name in virtual}
     return told
 
@@ -67,21 +70,3 @@ def virtual_names(said: str) -> set[str]:
         elif line.split() == ["Candidate:", "(none)"]:
             found.add(name)
     return found
-
-
-def _said(command: Sequence[str], timeout_s: float = TOOL_TIMEOUT_S) -> str:
-    """Return what a program printed; nothing of one that is not there or came to no end."""
-    import subprocess  # 8 ms, which most looks need not wait for
-
-    try:
-        done = subprocess.run(
-            list(command),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=timeout_s,
-            env={**os.environ, "LC_ALL": "C"},
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.decode(errors="replace")

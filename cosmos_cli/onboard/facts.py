@@ -14,7 +14,7 @@ import resource
 import sys
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from cosmos_cli.onboard.dpkg import installed_versions
 from cosmos_cli.onboard.files import content_hash, look_at, user_name
@@ -98,7 +98,7 @@ def facts(request: VerbRequest) -> dict[str, PlainValue]:
         "uses_pam": _uses_pam(etc) if asked.get("is_pam_asked") else None,
         "services": {name: service_state(name) for name in asked.get("services") or ()},
         **look(request),
-        "packages": installed_versions(asked.get("packages") or ()),
+        "packages": installed_versions(asked.get("packages") or (), _output),
         **(_end_sudo(sudo) if is_sudo_asked else {"sudo": None, "sudo_refusal": None}),
     }
 
@@ -231,17 +231,25 @@ def _throttled(sys_: str) -> int | None:
     return None
 
 
-def _output(command: list[str], timeout_s: float) -> str:
-    return _run(command, timeout_s)[1].decode(errors="replace")
+def _output(command: Sequence[str], timeout_s: float) -> str:
+    """Return what a program prints in English; nothing of one that is not there or came to no end."""
+    return _run(command, timeout_s, {"LC_ALL": "C"})[1].decode(errors="replace")
 
 
-def _run(command: list[str], timeout_s: float) -> tuple[int | None, bytes]:
+def _run(
+    command: Sequence[str], timeout_s: float, variables: Mapping[str, str]
+) -> tuple[int | None, bytes]:
     """Return a command's exit code and what it printed; None and nothing for one that never began or came to no end."""
     import subprocess  # 8 ms, which most looks need not wait for
 
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s, check=False
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=timeout_s,
+            env={**os.environ, **variables},
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired):
         return None, b""
@@ -335,7 +343,7 @@ def is_done(unless: str, *, as_root: bool) -> bool:
         f"exec >/dev/null 2>&1; {unless}",
     ]
     command = ["sudo", "-n", *shell] if as_root and os.geteuid() != 0 else shell
-    status, _ = _run(command, CONDITION_TIMEOUT_S + TOOL_TIMEOUT_S)
+    status, _ = _run(command, CONDITION_TIMEOUT_S + TOOL_TIMEOUT_S, {})
     if status == TIMED_OUT_STATUS:
         raise HelperRefusal("timeout", f"unless: {unless}: not done in {CONDITION_TIMEOUT_S:g} s")
     return status == 0

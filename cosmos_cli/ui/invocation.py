@@ -97,33 +97,41 @@ class Invocation:
 
 
 NOTHING = Invocation(verb="")
-_current = NOTHING
-_has_result = False
+
+
+@dataclass(slots=True)
+class _Current:
+    """The command line that this process carries out, and whether its result is printed."""
+
+    invocation: Invocation = NOTHING
+    has_result: bool = False
+
+
+_current = _Current()
 
 
 def forget() -> None:
     """Begin another command line, of which nothing is read yet."""
-    global _current, _has_result  # noqa: PLW0603 - a process carries out one command line
-    _current, _has_result = NOTHING, False
+    _current.invocation, _current.has_result = NOTHING, False
 
 
 def record(verb: str, words: Sequence[str], valued: frozenset[str], *, has_tail: bool) -> None:
     """Remember the command line that begins."""
-    global _current  # noqa: PLW0603 - a process carries out one command line
-    _current = Invocation(verb=verb, words=tuple(words), valued=valued, has_tail=has_tail)
+    _current.invocation = Invocation(
+        verb=verb, words=tuple(words), valued=valued, has_tail=has_tail
+    )
 
 
 def current() -> Invocation:
     """Return the command line that is being carried out; NOTHING before its words are understood."""
-    return _current
+    return _current.invocation
 
 
 def note_result() -> None:
     """Remember that the one document that --json promises is printed."""
-    global _has_result  # noqa: PLW0603 - a process carries out one command line
-    _has_result = True
+    _current.has_result = True
 
 
 def has_result() -> bool:
     """Tell whether it is printed: whoever reads it takes no second one."""
-    return _has_result
+    return _current.has_result

@@ -104,19 +104,24 @@ class Desk(SimpleNamespace):
         self.given.append((*values, *more.values()))
 
 
-def test_recorded_commands_are_given_in_their_ticks_and_those_of_devices_are_not(tmp_path):
+def record_commands(agents, rows):
+    """Leave commands of agent-01 as a run records them."""
     names = ("tick", "number", "kind", "at_s", "frame", "x", "y", "z", "duration_s")
     fields = ",".join(f'{{"name":"{name}","unit":"","kind":"float"}}' for name in names)
+    folder = agents / "agent-01"
+    folder.mkdir()
+    (folder / "commands.jsonl").write_text(
+        f'{{"schema":1,"stream":"commands","shape":"array","fields":[{fields}]}}\n{rows}'
+    )
+
+
+def test_recorded_commands_are_given_in_their_ticks_and_those_of_devices_are_not(tmp_path):
     rows = (
         '[2,0,"delta_v",1.5,"rtn",0.0,0.1,0.0,0.0]\n'
         '[2,1,"torque",1.5,"body",1.0,0.0,0.0,0.5]\n'
         f'[2,{2**30},"dipole",1.5,"body",1.0,0.0,0.0,0.5]\n'
     )
-    folder = tmp_path / "agent-01"
-    folder.mkdir()
-    (folder / "commands.jsonl").write_text(
-        f'{{"schema":1,"stream":"commands","shape":"array","fields":[{fields}]}}\n{rows}'
-    )
+    record_commands(tmp_path, rows)
     desk = Desk(given=[])
     context = SimpleNamespace(
         name="agent-01",
@@ -149,14 +154,8 @@ def test_recorded_commands_are_given_in_their_ticks_and_those_of_devices_are_not
 
 
 def test_recorded_commands_of_several_answers_that_came_at_once_are_given_again(tmp_path):
-    names = ("tick", "number", "kind", "at_s", "frame", "x", "y", "z", "duration_s")
-    fields = ",".join(f'{{"name":"{name}","unit":"","kind":"float"}}' for name in names)
     rows = "".join(f'[2,{n},"delta_v",1.5,"rtn",0.0,0.1,0.0,0.0]\n' for n in range(40))
-    folder = tmp_path / "agent-01"
-    folder.mkdir()
-    (folder / "commands.jsonl").write_text(
-        f'{{"schema":1,"stream":"commands","shape":"array","fields":[{fields}]}}\n{rows}'
-    )
+    record_commands(tmp_path, rows)
     desk = Desk(given=[])
     context = SimpleNamespace(
         name="agent-01",

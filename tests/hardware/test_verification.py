@@ -64,6 +64,7 @@ raise SystemExit(verification.main())
 def verify(
     folder,
     kind,
+    *,
     cycles=100,
     may_write=False,
     steps=STEPS,

@@ -19,37 +19,42 @@ POLICY = (
 )
 
 
-@pytest.fixture
-def asked(monkeypatch):
-    """Return the programs that were asked, each with its names."""
-    found = []
+class Programs:
+    """Programs of a machine; `asked` has each that was run, with its names."""
 
-    def said(command, timeout_s=0.0):
+    def __init__(self):
+        self.asked = []
+
+    def __call__(self, command, timeout_s):
         program = next((each for each in SAID if tuple(command[: len(each)]) == each), None)
-        found.append((command[0], *command[len(program or ()) or 2 :]))
+        self.asked.append((command[0], *command[len(program or ()) or 2 :]))
         return SAID[program] if program else POLICY
 
-    monkeypatch.setattr(dpkg, "_said", said)
-    return found
+
+@pytest.fixture
+def programs():
+    return Programs()
 
 
-def test_name_that_an_installed_package_provides_is_there(asked):
-    told = dpkg.installed_versions(["libasound2-dev", "libasound-dev", "mail-transport-agent"])
+def test_name_that_an_installed_package_provides_is_there(programs):
+    told = dpkg.installed_versions(
+        ["libasound2-dev", "libasound-dev", "mail-transport-agent"], programs
+    )
 
     assert told == {
         "libasound2-dev": "1.2.8",
         "libasound-dev": "libasound2-dev",
         "mail-transport-agent": None,
     }
-    assert asked[-1] == ("apt-cache", "libasound-dev")
+    assert programs.asked[-1] == ("apt-cache", "libasound-dev")
 
 
-def test_package_of_its_own_is_not_there_because_another_provides_its_name(asked):
+def test_package_of_its_own_is_not_there_because_another_provides_its_name(programs):
     """As python3-rpi.gpio, of which python3-rpi-lgpio takes the place: who lists it wants it."""
-    assert dpkg.installed_versions(["python3-rpi.gpio"]) == {"python3-rpi.gpio": None}
+    assert dpkg.installed_versions(["python3-rpi.gpio"], programs) == {"python3-rpi.gpio": None}
 
 
-def test_nothing_more_is_asked_where_all_are_there(asked):
-    assert dpkg.installed_versions(["libasound2-dev"]) == {"libasound2-dev": "1.2.8"}
-    assert dpkg.installed_versions([]) == {}
-    assert asked == [("dpkg-query", "libasound2-dev")]
+def test_nothing_more_is_asked_where_all_are_there(programs):
+    assert dpkg.installed_versions(["libasound2-dev"], programs) == {"libasound2-dev": "1.2.8"}
+    assert dpkg.installed_versions([], programs) == {}
+    assert programs.asked == [("dpkg-query", "libasound2-dev")]
