@@ -63,9 +63,8 @@ def read_regular_file(path: str | os.PathLike[str], *, bytes_max: int) -> bytes:
     """
     with _opened(path, bytes_max) as descriptor:
         pieces: list[bytes] = []
-        left = (
-            bytes_max + 1
-        )  # one byte more shows that the file has grown, or tells no true size as in /proc
+        # One byte more shows that the file has grown, or tells no true size as in /proc.
+        left = bytes_max + 1
         while left and (piece := os.read(descriptor, min(left, PIECE_BYTES))):
             pieces.append(piece)
             left -= len(piece)

@@ -122,9 +122,8 @@ def conversion(unit: str, wanted: str) -> float | None:
     exact = ours[0] / theirs[0]
     if not 0.0 < exact < math.inf:
         return None
-    rounded = float(
-        f"{exact:.12g}"
-    )  # 5 ms are 5000 us, not 5000.000000000001; a degree is what it is
+    # 5 ms are 5000 us, not 5000.000000000001; a degree is what it is.
+    rounded = float(f"{exact:.12g}")
     return rounded if math.isclose(rounded, exact, rel_tol=1e-15) else exact
 
 

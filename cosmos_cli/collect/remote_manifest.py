@@ -85,9 +85,8 @@ def check_offer(
             faults.append(f"{shown(path)}: cannot be read there: {shown(str(mapping['error']))}")
         elif reason := _fault_of_path(path, machine, owner_of) or _fault_of_file(mapping):
             faults.append(f"{shown(path)}: {reason}")
-        elif (
-            "kind" not in mapping
-        ):  # links, pipes and sockets hold no records; the manifest names them
+        elif "kind" not in mapping:
+            # Links, pipes and sockets hold no records; the manifest names them.
             files[path] = OfferedFile(
                 path=path, size_bytes=mapping["bytes"], sha256=mapping["sha256"]
             )

@@ -97,8 +97,7 @@ def _cut_off(living: Sequence[str]) -> list[str]:
     for run in list_runs(runs_root())[-RUNS_LOOKED_AT_MAX:]:
         summary = run.read_json(run.run_json) or {}
         is_open = summary.get("status") == "running" and str(run.path) not in alive
-        if is_open and not (run.read_json(run.plan_json) or {}).get(
-            "host"
-        ):  # else: ask its machine
+        # Of one elsewhere its machine is asked.
+        if is_open and not (run.read_json(run.plan_json) or {}).get("host"):
             names.append(run.name)
     return names

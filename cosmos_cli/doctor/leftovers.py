@@ -44,9 +44,8 @@ def uncollected(case: Case) -> Iterator[CheckRemark]:
         str(e["run_directory"]).rpartition("/")[2] for e in case.part("cosmos").get("living") or ()
     }
     waiting = [name for name in names if name not in alive]
-    unnamed = max(
-        0, case.part("cosmos").get("run_count", 0) - len(names)
-    )  # the oldest of very many
+    # The oldest of very many.
+    unnamed = max(0, case.part("cosmos").get("run_count", 0) - len(names))
     count = len(waiting) + unnamed
     if waiting:
         where = "" if case.is_here else " here; `cosmos wipe --uncollected` if nobody wants them"

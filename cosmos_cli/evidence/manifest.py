@@ -46,9 +46,8 @@ def _below(folder: Path) -> Iterator[tuple[Path, OSError | None]]:
     while waiting:
         here = waiting.pop()
         try:
-            os.stat(
-                os.path.join(here, ".")
-            )  # its names may be listed, and nothing of them be looked at
+            # Its names may be listed, and nothing of them be looked at.
+            os.stat(os.path.join(here, "."))
             with os.scandir(here) as entries:
                 for entry in entries:
                     path = Path(entry.path)

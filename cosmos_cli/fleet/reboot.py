@@ -133,9 +133,8 @@ class Rebooting:
             done = connection.run(
                 f"cat {BOOT_ID_FILE}", timeout_s=timeout_s, said_bytes_max=SMALL_BYTES_MAX
             )
-            is_told = (
-                done.exit_status == 0
-            )  # else what came is the words of a shell that lets nobody in
+            # What came otherwise is the words of a shell that lets nobody in.
+            is_told = done.exit_status == 0
             return done.stdout.decode(errors="replace").strip() if is_told else ""
 
 

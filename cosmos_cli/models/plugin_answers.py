@@ -175,9 +175,8 @@ class _Asking:
         self, simulation: Simulation, parameters: Any, agents: Agents, duration_s: float
     ) -> ParameterAnswers:
         """Ask all that follows from one set of parameters."""
-        plain = to_mapping(
-            parameters
-        )  # before anybody is asked: lists and mappings of it can be changed
+        # Before anybody is asked: lists and mappings of it can be changed.
+        plain = to_mapping(parameters)
         self._check(simulation, parameters, agents, duration_s)
         return ParameterAnswers(
             parameters=plain,
@@ -359,9 +358,8 @@ class _Asking:
         try:
             found = ask_labels(where, self._base_directory, parameters=parameters, agents=names)
         except MadnsError as error:
-            if (
-                not self._faults
-            ):  # a check that could not choose what labels are made of has said why
+            # A check that could not choose what labels are made of has said why.
+            if not self._faults:
                 self._blame(str(error))
             return None
         return AgentLabels(column=simulation.label_column, names=found)

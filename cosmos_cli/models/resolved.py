@@ -135,9 +135,8 @@ def _key(key: str) -> str:
 def _origin(document: Document, path: Path) -> Origin:
     if _is_written(document, path):
         return _origin_at(document, document.place(path))
-    if path[0] == _RULES and path[2:3] == (
-        "parameters",
-    ):  # of all agents, as the rule says nothing
+    # Of all agents, as the rule says nothing.
+    if path[0] == _RULES and path[2:3] == ("parameters",):
         return _origin(document, path[2:])
     if path[:2] == ("test", "set"):  # of a variable that the test sets
         return _origin_at(document, document.place(path[:2]))

@@ -213,9 +213,8 @@ def _restarts(scenario: Scenario) -> Iterator[SectionFault]:
         text = f"expected 0 with on_agent_loss: abort, got {scenario.agents.restarts_max}"
         yield ("agents", "restarts_max"), f"{text}; say on_agent_loss: continue"
     is_alone = scenario.agents.per_process == 1 or scenario.time.is_lockstep
-    if (
-        scenario.agents.restarts_max and not is_alone
-    ):  # in lockstep its half is made anew, no process
+    # In lockstep its half is made anew, no process.
+    if scenario.agents.restarts_max and not is_alone:
         text = f"expected 0 with agents.per_process: {scenario.agents.per_process}"
         why = "an agent that shares its process cannot be started again alone"
         yield ("agents", "restarts_max"), f"{text}, got {scenario.agents.restarts_max}: {why}"

@@ -74,9 +74,8 @@ def work_separately(
     read_fd, write_fd = os.pipe()
     heard_fd, said_fd = os.pipe()
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", DeprecationWarning
-        )  # of threads: the child uses none of them
+        # Of threads: the child uses none of them.
+        warnings.simplefilter("ignore", DeprecationWarning)
         pid = os.fork()
     if pid == 0:
         os.close(read_fd)

@@ -58,9 +58,8 @@ def compile_expression(text: str) -> re.Pattern[str]:
 def _has_items(value: Any) -> Any:
     if isinstance(value, list | tuple) and not value:
         raise ValueError("expected at least one item")
-    return (
-        tuple(value) if isinstance(value, list) else value
-    )  # strict validation takes no list here
+    # Strict validation takes no list here.
+    return tuple(value) if isinstance(value, list) else value
 
 
 NOT_EMPTY = BeforeValidator(_has_items)

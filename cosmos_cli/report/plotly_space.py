@@ -65,9 +65,8 @@ def _proportions(figure: SpaceFigure) -> dict[str, float]:
     every = np.concatenate([np.empty((0, 3)), *drawn])
     every = every[np.isfinite(every).all(axis=1)]
     sides = np.ptp(every, axis=0) if len(every) else np.zeros(3)
-    if (
-        not 0.0 < sides.max() < np.inf
-    ):  # a single point, or none, or farther apart than a float tells
+    # A single point, or none, or farther apart than a float tells.
+    if not 0.0 < sides.max() < np.inf:
         sides = np.ones(3)
     return dict(zip("xyz", (sides / sides.max()).tolist(), strict=True))
 

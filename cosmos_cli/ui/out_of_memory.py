@@ -22,9 +22,8 @@ def is_out_of_memory(error: BaseException) -> bool:
             return False
         if isinstance(present, MemoryError) or getattr(present, "errno", None) == errno.ENOMEM:
             return True
-        if (
-            isinstance(present, SyntaxError | SystemError) and _limits()
-        ):  # the interpreter's ways to say it, at times
+        # The interpreter's ways to say it, at times.
+        if isinstance(present, SyntaxError | SystemError) and _limits():
             return True
         if isinstance(present, ImportError | RuntimeError):
             text = str(present).lower()

@@ -91,9 +91,8 @@ class MessageFaults:
         """
         if action.word == PARTITION and self._agents.issubset(action.agents):
             raise ActionRefused("all agents are on one side: nobody is left on the other")
-        began_s = max(
-            action.t_s, self._now_s()
-        )  # that of a condition is due before the host hears of it
+        # That of a condition is due before the host hears of it.
+        began_s = max(action.t_s, self._now_s())
         self._rules.add(
             MessageRule(
                 number=action.number,

@@ -132,9 +132,8 @@ class Absences:
             assert worker is not None, "one lives"
             place = self._pool.number_of(worker)
             self._outbox.move(index, place)
-            incarnation = account.take_back(
-                index
-            )  # it is there again: what is sent with its data arrives
+            # It is there again: what is sent with its data arrives.
+            incarnation = account.take_back(index)
             data = pack(self._half.call("initial_data", account.names[index]))
             orders.setdefault(place, []).append((index, incarnation, data))
         self._barrier.forget_answers()

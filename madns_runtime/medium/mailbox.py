@@ -120,9 +120,8 @@ class Mailbox:
             self._refused += 1
             return
         is_over = delivery.arrives_s <= self._taken_s + TIME_EPSILON_S
-        self._late += (
-            is_over and delivery.sent_s < self._taken_s
-        )  # none is received in its own tick
+        # None is received in its own tick.
+        self._late += is_over and delivery.sent_s < self._taken_s
         self._serial += 1
         entry = (delivery.arrives_s, delivery.sender, delivery.sent_s, self._serial, delivery)
         heapq.heappush(self._held, entry)

@@ -67,7 +67,6 @@ def _write_all(data: bytes) -> None:
 if __name__ == "__main__":
     try:
         sys.exit(main(sys.argv[1:]))
-    except (
-        OSError
-    ):  # the other end of the session, or the process, has gone in the middle of a word
+    except OSError:
+        # The other end of the session, or the process, has gone in the middle of a word.
         sys.exit(OPERATOR_LEFT)

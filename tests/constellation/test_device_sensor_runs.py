@@ -101,9 +101,8 @@ def test_two_runs_record_the_same_and_the_error_of_hardware_is_a_figure(scenario
     for measured, truth in zip(rows["gyro"], rows["gyro_truth"], strict=True):
         assert measured[:2] == truth[:2]
         assert measured[2:4] == pytest.approx([0.0, 0.0], abs=1e-12)
-        assert truth[2:] == pytest.approx(
-            [0.0, 0.0, 0.0], abs=1e-5
-        )  # gravity turns it by that much
+        # Gravity turns it by that much.
+        assert truth[2:] == pytest.approx([0.0, 0.0, 0.0], abs=1e-5)
     compared = cosmos("diff", first["run"], second["run"], "--expect-same")
     assert compared.returncode == 0, compared.stderr
     errors = [line for line in compared.stdout.splitlines() if line.startswith(("gyro", "magnet"))]

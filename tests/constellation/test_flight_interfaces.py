@@ -731,9 +731,8 @@ TALK = [
 def test_what_a_protocol_of_ones_own_does_wrong_is_told_by_its_name(
     tmp_path, method, body, told, monkeypatch
 ):
-    monkeypatch.setattr(
-        isolation, "is_interruption", lambda error: False
-    )  # as in an agent's process
+    # As in an agent's process.
+    monkeypatch.setattr(isolation, "is_interruption", lambda error: False)
     (tmp_path / "own.py").write_text(OWN.replace("METHOD", method).replace("BODY", body))
     flight = attached({"kind": "stdio"}, "own.py:Wrong") | {"command": TALK}
 

@@ -529,9 +529,8 @@ def test_an_error_names_class_method_file_and_line_once(tmp_path):
     "kind", ["KeyboardInterrupt", "GeneratorExit", "SystemExit", "BaseException"]
 )
 def test_whatever_it_raises_is_blamed_on_its_own_line(tmp_path, kind, monkeypatch):
-    monkeypatch.setattr(
-        isolation, "is_interruption", lambda error: False
-    )  # as in an agent's process
+    # As in an agent's process.
+    monkeypatch.setattr(isolation, "is_interruption", lambda error: False)
     ship = Ship(tmp_path, body(f"raise {kind}('enough')"))
 
     with pytest.raises(BlamedError, match=rf"^G.step raised {kind}: enough \(guidance.py:5\)$"):

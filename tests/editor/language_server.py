@@ -22,9 +22,8 @@ class LanguageServer:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
         )
-        self._guard = threading.Timer(
-            patience_s, self._process.kill
-        )  # a wait for a line has no deadline of its own
+        # A wait for a line has no deadline of its own.
+        self._guard = threading.Timer(patience_s, self._process.kill)
         self._guard.start()
         self._number = 0
         self.published = {}

@@ -98,9 +98,8 @@ def ensure_system() -> System:
     with open(cache / "guest.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not folder.is_dir():
-            for path in cache.glob(
-                "guest-*"
-            ):  # of an older recipe, or of a builder that was killed
+            # Of an older recipe, or of a builder that was killed.
+            for path in cache.glob("guest-*"):
                 shutil.rmtree(path, ignore_errors=True)
             _build(folder)
     return System(folder)

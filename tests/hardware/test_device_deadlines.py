@@ -201,9 +201,8 @@ def test_outputs_are_safe_in_time_though_the_drivers_libraries_take_longer(tmp_p
 def test_a_device_that_is_back_before_the_guardian_is_done_does_not_stay_lost(
     tmp_path, log, monkeypatch
 ):
-    monkeypatch.setattr(
-        manager, "END_S", 60.0
-    )  # for the guardian's last attempt, however long it waits
+    # For the guardian's last attempt, however long it waits.
+    monkeypatch.setattr(manager, "END_S", 60.0)
     bench = moved_bench(tmp_path, safe_s=1.0)
     pid = bench.pid_of()
     os.kill(pid, signal.SIGKILL)

@@ -513,9 +513,8 @@ def test_what_the_owner_last_said_is_not_carried_out_after_its_end(tmp_path):
 
 def test_a_healthy_process_is_not_given_up_when_its_owner_ends(tmp_path, monkeypatch):
     """The device is made safe before the guardian looks, and again moved by the owner that was started anew."""
-    monkeypatch.setattr(
-        guardian, "GRACE_S", 3.0
-    )  # a busy machine lets a process wait for longer than its own
+    # A busy machine lets a process wait for longer than its own.
+    monkeypatch.setattr(guardian, "GRACE_S", 3.0)
     with line_bench(tmp_path) as (bench, terminal):
         line, header = bench.hardware["line"], bench.manager.page_of("pi22/line").header
         bench.until(lambda: line.status == "ok")

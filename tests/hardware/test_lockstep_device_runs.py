@@ -470,9 +470,8 @@ def test_all_frames_that_an_agent_writes_in_a_tick_are_put_out(tmp_path):
     put_out = [
         bytes.fromhex(row[-1]) for row in rows(next(folder.glob("devices/*/line/sent.jsonl")))
     ]
-    assert (
-        put_out == [b"%d" % number for number in range(2000)] * 3
-    )  # those of the last tick are left
+    # Those of the last tick are left.
+    assert put_out == [b"%d" % number for number in range(2000)] * 3
     assert run["devices"]["agent-01/line"]["counts"]["writes_left"] == 2000
 
 

@@ -101,9 +101,8 @@ def test_as_many_points_as_may_wait_find_room_however_wide_their_output_is():
 def test_an_older_value_that_found_no_room_does_not_come_behind_a_newer_one(device, monkeypatch):
     made, _ = device
     sent = []
-    room = iter(
-        [False, False, True, True]
-    )  # there is some between the look for the old one and the new one
+    # There is some between the look for the old one and the new one.
+    room = iter([False, False, True, True])
 
     def send(end, message):
         has_room = next(room)
@@ -153,9 +152,8 @@ def test_a_value_and_a_profile_of_an_output_that_found_no_room_come_in_their_ord
 def test_a_value_that_ends_a_profile_does_not_overtake_it(device, monkeypatch):
     made, _ = device
     sent = []
-    room = iter(
-        [False, False, True, True]
-    )  # there is some between the look for the points and the value
+    # There is some between the look for the points and the value.
+    room = iter([False, False, True, True])
 
     def send(end, message):
         has_room = next(room, True)

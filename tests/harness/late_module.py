@@ -14,9 +14,8 @@ class LateModule:
         self._name = name
 
     def __getattr__(self, attribute: str) -> object:
-        if (
-            attribute.startswith("_") or attribute == "pytestmark"
-        ):  # what pytest asks everything that it meets
+        # What pytest asks everything that it meets.
+        if attribute.startswith("_") or attribute == "pytestmark":
             raise AttributeError(attribute)
         return getattr(self.load(), attribute)
 

@@ -104,9 +104,8 @@ def test_usage_is_since_the_last_call():
     total = 0
     while usage.read()[1] == 0.0:  # until the processor's clock has moved
         total += sum(range(1000))
-    total += sum(
-        range(3_000_000)
-    )  # beside which what is computed between its two clocks is nothing
+    # Beside which what is computed between its two clocks is nothing.
+    total += sum(range(3_000_000))
 
     assert usage.read()[1] <= 100.0 * 1.5
 

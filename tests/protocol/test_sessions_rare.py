@@ -479,9 +479,8 @@ def test_an_agent_that_was_itself_held_up_between_rare_calls_blames_nobody():
 def test_an_agent_whose_set_up_took_long_blames_nobody_for_what_it_did_not_hear():
     w = World(("agent-1",))
     w.mute.add("agent-1")  # in its set-up
-    w.join(
-        "agent-1", PingPlan(brings_clock_up=False, delay_s=9.0)
-    )  # which comes before it knows the clock
+    # Which comes before it knows the clock.
+    w.join("agent-1", PingPlan(brings_clock_up=False, delay_s=9.0))
     w.run_for(0.1)
     session = w.agents["agent-1"]
     assert session.state is AgentState.SIMULATION_SETUP

@@ -326,9 +326,8 @@ def test_exception_of_a_reader_loses_no_timer(reactor, pipe):
 
     reactor.add_reader(read_fd, fail)
     os.write(write_fd, b"x")
-    due_s = (
-        reactor.now_s() + 0.5
-    )  # the loop begins before, also where it has to wait for a processor
+    # The loop begins before, also where it has to wait for a processor.
+    due_s = reactor.now_s() + 0.5
     reactor.call_at(due_s, lambda: ran.append("timer"))
     reactor.call_at(due_s, reactor.stop)
 

@@ -127,9 +127,8 @@ def test_a_step_that_blocks_is_not_charged_with_what_the_kernel_counted_long_bef
     monkeypatch.setattr(loop_account, "thread_time", float)
     for each in (loop.account._waited, loop.account._stolen):
         monkeypatch.setattr(each, "_now_s", lambda: clock.now_s)
-    for _ in range(
-        100
-    ):  # a second in which the loop slept, and waited now and then for a processor
+    # A second in which the loop slept, and waited now and then for a processor.
+    for _ in range(100):
         clock.now_s += PERIOD_S
         loop.reactor.slept_s += PERIOD_S
         loop.kernel[count] += 0.002

@@ -96,9 +96,8 @@ def assert_nobody_else_noticed(folder, document):
     """Check that no tick is missing, and that the others' computers answered all."""
     assert document["status"] == "complete"
     assert document["agents"]["lost"] == []
-    assert (
-        document["timing"]["ticks"] == 3 * DURATION_S * HZ
-    )  # missed ones, as on a busy machine, among them
+    # Missed ones, as on a busy machine, among them.
+    assert document["timing"]["ticks"] == 3 * DURATION_S * HZ
     assert document["records"]["dropped"] == 0
     for agent in SOUND:
         flight = flight_of(document, agent)

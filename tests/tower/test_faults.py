@@ -283,9 +283,8 @@ def test_connections_are_cut_and_new_ones_taken(tower8):
 
     tower8.fault("pi05", "cut")
 
-    assert (
-        session.wait(timeout=120) == 255
-    )  # its input stays open: the end of that would end it, too
+    # Its input stays open: the end of that would end it, too.
+    assert session.wait(timeout=120) == 255
     session.communicate()
     tower8.run("pi05", "true")
 

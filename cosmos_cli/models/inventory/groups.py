@@ -108,9 +108,8 @@ class GroupTree:
         depths: dict[str, int] = {}
         parents_left = {name: len(group.parents) for name, group in self.groups.items()}
         waiting = [ALL]
-        while (
-            waiting
-        ):  # a group comes up when the last of its parents is counted: there is no circle
+        # A group comes up when the last of its parents is counted: there is no circle.
+        while waiting:
             group = self.groups[waiting.pop()]
             depths[group.name] = max((depths[name] + 1 for name in group.parents), default=0)
             for child in group.children:

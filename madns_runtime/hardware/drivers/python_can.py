@@ -105,9 +105,8 @@ class PythonCanBus:
         self._has_ended.set()
         self._listener.join(20 * LISTEN_S)
         self._bus.shutdown()
-        if (
-            not self._listener.is_alive()
-        ):  # else it may still write there, and the number would be another file's
+        # One that lives may still write there, and the number would be another file's.
+        if not self._listener.is_alive():
             os.close(self._signal)
 
     def _listen(self) -> None:

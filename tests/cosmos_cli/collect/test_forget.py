@@ -152,8 +152,7 @@ def test_note_of_wrong_types_is_taken_for_none(split, monkeypatch, damage):
     note = split.run.path / "machines/pi01/retrieved.json"
     write_json(note, {**json.loads(note.read_bytes()), **damage})
 
-    assert (
-        app.run(["collect", "1"]) == 5
-    )  # nothing of it is there any more, and no note says that it came
+    # Nothing of it is there any more, and no note says that it came.
+    assert app.run(["collect", "1"]) == 5
 
     assert [p["machine"] for p in document(split)["problems"]] == ["pi01"]

@@ -698,9 +698,8 @@ def test_closed_pipe_is_no_error_to_talk_about():
     os.close(writer)
 
     assert process.stderr == b""
-    assert (
-        process.returncode == 141
-    )  # as README says, and as a shell tells of who is ended by SIGPIPE
+    # As README says, and as a shell tells of who is ended by SIGPIPE.
+    assert process.returncode == 141
 
 
 @pytest.mark.process

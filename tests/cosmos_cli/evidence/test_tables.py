@@ -125,9 +125,8 @@ def test_large_integers_without_null_are_exact(tmp_path):
 
 
 def test_large_integers_are_exact_where_others_of_the_field_are_null(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        reader, "BLOCK_BYTES", 512
-    )  # so that some blocks have no null, some nothing else
+    # So that some blocks have no null, some nothing else.
+    monkeypatch.setattr(reader, "BLOCK_BYTES", 512)
     made = SyntheticRun(tmp_path)
     schema = StreamSchema("big", (Field("n", "", "int"), Field("name", "", "str")))
     values = [2**60 + n for n in range(60)] + [None] * 60 + [None, -(2**53) - 1, 3, 2**53 + 1] * 9

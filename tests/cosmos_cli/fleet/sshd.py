@@ -147,9 +147,8 @@ class Sshd:
 
     def cut(self) -> None:
         """Kill what serves the open connections; the server itself goes on."""
-        for pid in self._signal(
-            signal.SIGSTOP
-        ):  # who is stopped starts nobody that would be missed
+        # Who is stopped starts nobody that would be missed.
+        for pid in self._signal(signal.SIGSTOP):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 

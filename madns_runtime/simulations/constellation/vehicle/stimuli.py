@@ -169,16 +169,14 @@ class StimulusPlayer:
         if points or self._from_s is not None:
             from_s = self._from_s
             if from_s is not None and points:
-                from_s = min(
-                    from_s, points[0][0]
-                )  # a point at that time may lie before it by a rounding
+                # A point at that time may lie before it by a rounding.
+                from_s = min(from_s, points[0][0])
             self._device.play(settings.output, points, from_s=from_s)
             self._points += len(points)
             self._from_s = None
             if (next_s := self._next / rate_hz) > self._end_s + GRID_ROUNDING:
-                self._device.play(
-                    settings.output, (), from_s=next_s
-                )  # the run ends: none is missing
+                # The run ends: none is missing.
+                self._device.play(settings.output, (), from_s=next_s)
         return (self._next - 1) / rate_hz - settings.lead_s * (1.0 - 1.0 / PARTS)
 
     def _value(self) -> Values:
