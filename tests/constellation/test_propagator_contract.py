@@ -2,7 +2,6 @@
 
 import math
 import pickle  # noqa: TID251 - as executors do with arguments
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -288,19 +287,17 @@ def test_a_fleet_of_wrecks_stays_where_it_is(kind):
     assert not found.any()
 
 
-@pytest.mark.parametrize(
-    ("name", "from_s", "scale"),
-    # Times so late differ by more than the longest step; numba counts from the call on, and no step from no number passes.
-    [("scipy", 5e6, 1.0), ("numba", 5.0, np.nan)],
-)
-def test_a_tolerance_out_of_reach_is_said(name, from_s, scale, folder):
-    kind = make_kind(name, folder, step_s_max=1e-13)
+@pytest.mark.parametrize("name", ["scipy", "numba"])
+def test_a_tolerance_out_of_reach_is_said(name, folder):
+    kind = make_kind(name, folder)
     states = orbits()
-    states[:, 3:] *= scale
+    states[:, 3:] = 1e200  # Errors squared are past all numbers: no step passes.
 
-    # Straight to the class: some of this does not pass the check before it.
-    with pytest.raises(ConfigurationError, match=re.escape(f"{name} DOP853 from {from_s:g} s")):
-        load_propagator(name).propagate(states, from_s, np.array([from_s + 1.0]), kind.parameters())
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(ConfigurationError, match=f"{name} DOP853 from 5e\\+06 s"),
+    ):
+        propagate(states, 5e6, np.array([5e6 + 1.0]), kind.parameters())
 
 
 def test_what_does_not_fit_is_said_all_at_once(kind):

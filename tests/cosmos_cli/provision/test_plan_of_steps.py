@@ -226,7 +226,7 @@ def test_disk_without_room_for_all_is_pruned_before_anything_else_takes_room(mis
         return
     assert refused(steps, disk={"free_bytes": free}, **old) == (
         "disk_full",
-        "about 116 MB are needed on /home/pi, 16 MB are free, and pruning frees 100 MB",
+        "about 116.0 MB are needed on /home/pi, 16.0 MB are free, and pruning frees 100.0 MB",
     )
 
 
