@@ -32,8 +32,8 @@ from cosmos_cli.system.import_turn import IMPORT_TURN
 from cosmos_cli.testing.junit import (
     JunitCase,
     JunitOption,
-    check_junit,
     junit_case_of,
+    prepare_junit,
     write_junit,
 )
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption, losing_output
@@ -95,13 +95,13 @@ def run(
         forks=forks,
         connecting=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
     )
-    with told_as_options({"time.duration_s": "--duration"}, set_ or ()):
-        checked = load_scenario(scenario, [*(set_ or ()), *duration], warn=console.warn)
     if junit is not None and (check or detach):
         raise InputError("--junit writes the verdict: leave out --check and --detach")
+    prepare_junit(junit)
+    with told_as_options({"time.duration_s": "--duration"}, set_ or ()):
+        checked = load_scenario(scenario, [*(set_ or ()), *duration], warn=console.warn)
     if check:
         raise typer.Exit(_check(console, checked, options, tuple(inventory or ()), limit))
-    check_junit(junit)
     _run(console, checked, options, junit)
 
 

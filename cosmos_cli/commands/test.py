@@ -18,7 +18,7 @@ from cosmos_cli.models.test_settings import SECTION
 from cosmos_cli.testing.case import CaseSettings, SuiteCase
 from cosmos_cli.testing.discovery import ChosenCases, FoundScenarios, choose_cases, find_scenarios
 from cosmos_cli.testing.expression import parse_expression
-from cosmos_cli.testing.junit import JunitCase, JunitOption, check_junit, write_junit
+from cosmos_cli.testing.junit import JunitCase, JunitOption, prepare_junit, write_junit
 from cosmos_cli.testing.last_failed import read_failed, remember_failed
 from cosmos_cli.testing.outcome import CaseOutcome
 from cosmos_cli.testing.seeds import parse_seeds
@@ -119,6 +119,7 @@ def test(
             " --full-length and --realtime-max"
         )
     _refuse_section(set_ or ())
+    prepare_junit(junit)
     settings = CaseSettings(
         overrides=tuple(set_ or ()), is_shortened=not full_length, realtime_s_max=realtime_s_max
     )
@@ -133,7 +134,6 @@ def test(
         keeps_all=keep,
         updates_baselines=update_baselines,
     )
-    check_junit(junit)
     check_folder(options.runs)
     started_utc, started_s = utc_now(), time.monotonic()
     result = _run(console, chosen.cases, options)

@@ -15,6 +15,7 @@ from cosmos_cli.models.resolved import origins, relative_root, resolved_lines
 from cosmos_cli.models.scenario_outline import check_test
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.foreign_text import clean_line
+from madns_runtime.errors import ConfigurationError, MissingExtraError, PluginError
 
 READERS = {
     "private": "",
@@ -47,6 +48,10 @@ def validate(
         except InputError as error:
             faults += error.all_faults
             omitted += error.omitted
+        except (ConfigurationError, PluginError, MissingExtraError) as error:
+            if len(files) == 1:
+                raise
+            faults.append(Fault(text=str(error), file=str(path)))
         else:
             found.append(scenario_file)
             for note in (*place_notes(scenario_file), *map(Fault.render, scenario_file.remarks)):

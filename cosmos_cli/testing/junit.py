@@ -104,9 +104,9 @@ def _add(suite: ElementTree.Element, case: JunitCase) -> None:
         ElementTree.SubElement(element, "skipped", {"message": clean_line(case.skipped)})
 
 
-def check_junit(path: Path | None) -> None:
+def prepare_junit(path: Path | None) -> None:
     """
-    Make the folders above the file, before the runs that it is to tell of.
+    Make the folders above the file and remove an earlier one, whose results would be taken for those that are to come.
 
     Raises:
         InputError: It could not be written.
@@ -120,6 +120,10 @@ def check_junit(path: Path | None) -> None:
         raise _unwritable(path, error.strerror) from error
     if not os.access(path.parent, os.W_OK):
         raise _unwritable(path, f"no right to write in {path.parent}")
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error.strerror) from error
 
 
 def _unwritable(path: Path, why: str | None) -> InputError:

@@ -15,13 +15,14 @@ from pydantic import TypeAdapter
 
 from cosmos_cli import app
 from cosmos_cli.cache import cache_folder
-from cosmos_cli.commands import command_group, runs
+from cosmos_cli.commands import command_group, runs, validate
 from cosmos_cli.commands.init import render, write_new
 from cosmos_cli.errors import ExitCode, InputError, RunFailedError
 from cosmos_cli.launch.feasibility import Resources, judge
 from cosmos_cli.launch.plan_view import verdict_words
 from cosmos_cli.models import parameters, scenario_outline, timeline
-from madns_runtime.errors import MachineError, PluginError
+from cosmos_cli.models.loading import load_scenario
+from madns_runtime.errors import MachineError, MissingExtraError, PluginError
 from madns_runtime.plugin.api import Demand
 
 ROOT = Path(__file__).parents[3]
@@ -106,6 +107,25 @@ def test_validate_shows_the_faults_of_all_files(cosmos):
         "b.yaml:4:1: sed: unknown key, did you mean seed?\n    sed: 1\n    ^\n"
         "c.yaml:4:7: seed: expected >= 0, got -1\n    seed: -1\n          ^\n"
     )
+
+
+def test_validate_goes_on_behind_what_no_line_of_a_file_is_to_blame_for(cosmos, monkeypatch):
+    Path("b.yaml").write_text(SCENARIO)
+    Path("c.yaml").write_text(SCENARIO + "seed: -1\n")
+    lacking = "thing is not installed here; install it with: pip install 'cosmos-madns[host]'\n"
+
+    def load(path, *arguments, **more):
+        if path.name == "b.yaml":
+            raise MissingExtraError("thing", "host")
+        return load_scenario(path, *arguments, **more)
+
+    monkeypatch.setattr(validate, "load_scenario", load)
+    code, out, err = cosmos("validate", "b.yaml", "c.yaml", "a.yaml")
+
+    assert code == ExitCode.BAD_INPUT
+    assert out.startswith("a.yaml: ok")
+    assert err.startswith(f"b.yaml: {lacking}c.yaml:4:7: seed: ")
+    assert cosmos("validate", "b.yaml")[2] == f"error: {lacking}"
 
 
 def test_validate_json_holds_the_whole_scenario(cosmos):

@@ -6,8 +6,15 @@ from pathlib import Path
 import pytest
 from lxml import etree
 
-from cosmos_cli.errors import InputError
-from cosmos_cli.testing.junit import JunitCase, check_junit, junit_case_of, junit_text, write_junit
+from cosmos_cli.app import run
+from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.testing.junit import (
+    JunitCase,
+    junit_case_of,
+    junit_text,
+    prepare_junit,
+    write_junit,
+)
 
 SCHEMA = etree.XMLSchema(etree.parse(Path(__file__).with_name("junit.xsd")))
 FOREIGN = "\x1b[31mred\x00\x07 <&> \ud800 \ufffe \u202e\n\ttab ]]> \U0001f680"
@@ -104,12 +111,23 @@ def test_folders_are_made_and_what_cannot_be_written_is_told(tmp_path):
 def test_what_could_not_be_written_is_told_before_anything_runs(tmp_path):
     (tmp_path / "file").touch()
 
-    check_junit(None)
-    check_junit(tmp_path / "new/j.xml")
+    prepare_junit(None)
+    prepare_junit(tmp_path / "new/j.xml")
     with pytest.raises(InputError, match="file/j.xml: cannot be written: "):
-        check_junit(tmp_path / "file/j.xml")
+        prepare_junit(tmp_path / "file/j.xml")
     with pytest.raises(InputError, match="cannot be written: it is a folder; name a file"):
-        check_junit(tmp_path)
+        prepare_junit(tmp_path)
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="cannot be written: it is a device, a pipe or a stream"):
-        check_junit(tmp_path / "pipe")
+        prepare_junit(tmp_path / "pipe")
+
+
+def test_an_earlier_file_is_gone_before_what_it_would_be_taken_for(tmp_path, capsys):
+    earlier = tmp_path / "j.xml"
+    missing = tmp_path / "missing.yaml"
+
+    for command in ("run", "test"):
+        earlier.write_text("<testsuites/>")
+        assert run([command, str(missing), "--junit", str(earlier)]) == ExitCode.BAD_INPUT
+        assert "missing.yaml" in capsys.readouterr().err
+        assert not earlier.exists()
