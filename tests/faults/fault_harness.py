@@ -41,7 +41,13 @@ SCENARIO: dict[str, Any] = {
     "agents": {"count": 3, "tick_hz": 20},
     "time": {"duration_s": 2, "rtf_tolerance": 0.9},
     "deadline": {"overrun_ms": 1000, "max_miss_ratio": 1},
-    "timeouts": {"start_lead_s": 0.3, "shutdown_s": 60, "silence_s": 30},
+    "timeouts": {
+        "host_start_s": 300,
+        "agents_ready_s": 300,
+        "start_lead_s": 0.3,
+        "shutdown_s": 60,
+        "silence_s": 30,
+    },
     "recording": {"flush_interval_s": 0.1},
     "executor": {"kind": "thread"},
 }
