@@ -131,3 +131,16 @@ def test_an_earlier_file_is_gone_before_what_it_would_be_taken_for(tmp_path, cap
         assert run([command, str(missing), "--junit", str(earlier)]) == ExitCode.BAD_INPUT
         assert "missing.yaml" in capsys.readouterr().err
         assert not earlier.exists()
+
+
+def test_a_scenario_that_is_taken_for_the_file_is_kept(tmp_path, capsys):
+    scenario = tmp_path / "a.yaml"
+    scenario.write_text("name: a\nsimulation: counter\n")
+
+    assert run(["test", "--junit", str(scenario)]) == ExitCode.BAD_INPUT
+    assert "a.yaml: cannot be written: what is there is no XML" in capsys.readouterr().err
+    assert scenario.read_text().startswith("name: a")
+
+    (tmp_path / "empty.xml").touch()
+    prepare_junit(tmp_path / "empty.xml")
+    assert not (tmp_path / "empty.xml").exists()
