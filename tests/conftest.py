@@ -5,9 +5,11 @@ from __future__ import annotations
 import multiprocessing.process
 import os
 import platform
+import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from harness.warm_commands import WarmCommands
@@ -24,6 +26,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # which is more than half of what the whole suite costs then.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+# Where `python3` is a version manager's script, each helper on a machine would wait for five shells before it starts.
+INTERPRETER = Path(sys.executable).resolve()
+if Path(shutil.which("python3") or sys.executable).resolve() != INTERPRETER:
+    os.environ["PATH"] = f"{INTERPRETER.parent}{os.pathsep}{os.environ['PATH']}"
 
 # numpy's threads, one per processor, wait busily for work that no test has for them: workers of the suite have none.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

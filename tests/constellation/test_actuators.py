@@ -73,19 +73,19 @@ def test_what_cannot_be_burnt_is_refused_with_figures():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("propellant_kg", range(1, 90))
-def test_all_that_is_left_can_be_asked_for(propellant_kg):
-    thruster = Thruster(isp_s=220.0, propellant_kg=propellant_kg)
-    full = tank(thruster)
-    all_m_s = -220.0 * 9.80665 * math.log1p(-propellant_kg / 100.0)
+def test_all_that_is_left_can_be_asked_for():
+    for propellant_kg in range(1, 90):
+        thruster = Thruster(isp_s=220.0, propellant_kg=propellant_kg)
+        full = tank(thruster)
+        all_m_s = -220.0 * 9.80665 * math.log1p(-propellant_kg / 100.0)
 
-    burn = fire(thruster, full, (all_m_s, 0.0, 0.0), chance())
+        burn = fire(thruster, full, (all_m_s, 0.0, 0.0), chance())
 
-    assert isinstance(burn, Burn)
-    assert burn.propellant_kg <= propellant_kg
-    assert burn.magnitude_m_s == pytest.approx(all_m_s, rel=1e-10)
-    more = fire(thruster, full, (all_m_s + 1e-6, 0.0, 0.0), chance())
-    assert isinstance(more, ActuatorRefusal)
+        assert isinstance(burn, Burn), propellant_kg
+        assert burn.propellant_kg <= propellant_kg
+        assert burn.magnitude_m_s == pytest.approx(all_m_s, rel=1e-10)
+        more = fire(thruster, full, (all_m_s + 1e-6, 0.0, 0.0), chance())
+        assert isinstance(more, ActuatorRefusal), propellant_kg
 
 
 def test_errors_have_the_deviations_that_the_scenario_says():

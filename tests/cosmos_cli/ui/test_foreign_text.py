@@ -59,13 +59,13 @@ def test_long_text_is_cut_with_a_count_and_within_its_bound():
     assert clean_line("\x1b" * 10_000, length_max=100).endswith(" characters more)")
 
 
-@pytest.mark.parametrize("size", range(90, 300))
-def test_note_of_what_was_cut_is_whole_whatever_the_number_of_its_digits(size: int) -> None:
-    cut = clean_line("x" * size, length_max=85)
+def test_note_of_what_was_cut_is_whole_whatever_the_number_of_its_digits() -> None:
+    for size in range(90, 300):
+        cut = clean_line("x" * size, length_max=85)
 
-    kept, _, note = cut.partition("... ")
-    assert len(cut) <= 85
-    assert note == f"({size - len(kept)} characters more)"
+        kept, _, note = cut.partition("... ")
+        assert len(cut) <= 85
+        assert note == f"({size - len(kept)} characters more)"
 
 
 @pytest.mark.slow

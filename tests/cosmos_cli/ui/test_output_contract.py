@@ -4,8 +4,6 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
-
 import cosmos_cli
 
 PACKAGE = Path(cosmos_cli.__file__).parent
@@ -84,17 +82,21 @@ def is_forbidden(call):
     return called in FORBIDDEN_CALLS
 
 
-@pytest.mark.parametrize("path", modules(), ids=name_of)
-def test_module_prints_through_the_console_alone(path):
-    name = name_of(path)
-    found = list(faults(path))
+def test_every_module_prints_through_the_console_alone():
+    found = {name_of(path): list(faults(path)) for path in modules()}
 
-    if name in BEFORE_ALL:
-        assert sorted(text.split(": ", 1)[1] for text in found) == BEFORE_ALL[name]
-    elif name in HANDED_ON:
-        assert all(re.search(r"return (\w*View|kind)\(sys\.stderr, ", text) for text in found)
-    elif name not in OUTPUT and not name.startswith("templates/"):
-        assert found == []
+    assert len(found) > 300
+    for name, expected in BEFORE_ALL.items():
+        assert sorted(text.split(": ", 1)[1] for text in found.pop(name)) == expected
+    for name in HANDED_ON:
+        handed_on = found.pop(name)
+        assert all(re.search(r"return (\w*View|kind)\(sys\.stderr, ", text) for text in handed_on)
+    others = {
+        name: texts
+        for name, texts in found.items()
+        if texts and name not in OUTPUT and not name.startswith("templates/")
+    }
+    assert others == {}
 
 
 def test_contract_sees_what_it_forbids(tmp_path, monkeypatch):
