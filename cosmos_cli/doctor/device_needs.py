@@ -10,6 +10,7 @@ from typing import Any
 from cosmos_cli.models.device_needs import DeviceNeeds, MachineNeeds
 from cosmos_cli.models.machine_facts import condition_key
 from cosmos_cli.onboard.content_store import MARK
+from cosmos_cli.onboard.dpkg import names_asked
 from cosmos_cli.provision.device_steps import membership
 
 UP = "`cosmos up -i INVENTORY`"
@@ -60,9 +61,8 @@ def _items(
 ) -> Iterator[tuple[tuple[Condition, ...], str, str]]:
     needs, python = device.needs, str(greeting["executable"])
     for package in needs.packages:
-        test = (
-            f"dpkg-query -W -f='${{db:Status-Status}}' {shlex.quote(package)} | grep -qx installed"
-        )
+        names = shlex.join(names_asked([package]))
+        test = f"dpkg-query -W -f='${{db:Status-Status}}\\n' {names} | grep -qx installed"
         yield (_unless(test),), f"no package {package}", UP
     for group in needs.groups if greeting["uid"] else ():
         yield (membership(group),), f"who logs in is not in the group {group}", UP

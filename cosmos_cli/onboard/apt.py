@@ -22,7 +22,7 @@ from cosmos_cli.onboard.apt_words import (
     planned_changes,
     trouble_of,
 )
-from cosmos_cli.onboard.dpkg import DPKG_QUERY, versions_of
+from cosmos_cli.onboard.dpkg import DPKG_QUERY, names_asked, version_of, versions_of
 from cosmos_cli.onboard.request_loop import AnswerPart, HelperRefusal, VerbRequest, verb
 from cosmos_cli.onboard.scratch import scratch_file, scratch_folder
 from cosmos_cli.onboard.system import SIGN_OF_LIFE_S, read_end, start, tool_path, wait
@@ -131,8 +131,9 @@ def installed(names: Sequence[str]) -> dict[str, str | None]:
     Raises:
         Refusal: UNSUPPORTED, the machine has no dpkg.
     """
-    found = _ask_dpkg([name.partition("=")[0] for name in names]) if names else {}
-    return {name: found.get(name.partition("=")[0]) for name in names}
+    packages = {name: name.partition("=")[0] for name in names}
+    found = _ask_dpkg(names_asked([*packages.values()])) if names else {}
+    return {name: version_of(package, found) for name, package in packages.items()}
 
 
 def snapshot() -> dict[str, str]:

@@ -26,8 +26,9 @@ def installed_versions(
     A name that no package has, such as libasound-dev, is there when a package is that provides it, and that is told in
     its place; apt would install nothing for it. One that is also a package's own is not: apt would install that.
     """
-    found: dict[str, str] = versions_of(ask([*DPKG_QUERY, *names], TOOL_TIMEOUT_S)) if names else {}
-    told: dict[str, str | None] = {name: found.get(name) for name in names}
+    said = ask([*DPKG_QUERY, *names_asked(names)], TOOL_TIMEOUT_S) if names else ""
+    found = versions_of(said)
+    told = {name: version_of(name, found) for name in names}
     missing = [name for name, version in told.items() if version is None and ":" not in name]
     providers = providers_of(ask(PROVIDES_QUERY, TOOL_TIMEOUT_S)) if missing else {}
     provided = [name for name in missing if name in providers]
@@ -35,6 +36,21 @@ def installed_versions(
         virtual = virtual_names(ask(["apt-cache", "policy", *provided], APT_CACHE_TIMEOUT_S))
         told |= {name: providers[name] for name in provided if name in virtual}
     return told
+
+
+def names_asked(names: Sequence[str]) -> list[str]:
+    """Return what dpkg is asked for: a package for any architecture, such as adduser, is none of adduser:amd64 to it."""
+    return [each for name in names for each in dict.fromkeys((name, _for_any(name)))]
+
+
+def version_of(name: str, found: Mapping[str, str]) -> str | None:
+    """Return the version of a package among `versions_of`; as apt sees it, one for any architecture is of each."""
+    return found.get(name) or found.get(_for_any(name))
+
+
+def _for_any(name: str) -> str:
+    package, colon, _ = name.partition(":")
+    return f"{package}:all" if colon else package
 
 
 def versions_of(said: str) -> dict[str, str]:

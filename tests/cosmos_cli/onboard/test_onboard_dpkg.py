@@ -54,6 +54,19 @@ def test_package_of_its_own_is_not_there_because_another_provides_its_name(progr
     assert dpkg.installed_versions(["python3-rpi.gpio"], programs) == {"python3-rpi.gpio": None}
 
 
+def test_package_for_any_architecture_is_there_for_each(programs):
+    """As apt sees it; to dpkg, adduser:arm64 is none, and each `up` installed it again."""
+    said = "adduser all installed 3.134\nlibc6 arm64 installed 2.36\n"
+
+    told = dpkg.installed_versions(
+        ["adduser:arm64", "libc6:arm64", "libc6:armhf"],
+        lambda command, timeout_s: said if tuple(command[:3]) == dpkg.DPKG_QUERY else "",
+    )
+
+    assert told == {"adduser:arm64": "3.134", "libc6:arm64": "2.36", "libc6:armhf": None}
+    assert dpkg.names_asked(["adduser:arm64", "git"]) == ["adduser:arm64", "adduser:all", "git"]
+
+
 def test_nothing_more_is_asked_where_all_are_there(programs):
     assert dpkg.installed_versions(["libasound2-dev"], programs) == {"libasound2-dev": "1.2.8"}
     assert dpkg.installed_versions([], programs) == {}
