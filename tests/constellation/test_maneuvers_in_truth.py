@@ -314,6 +314,19 @@ def test_a_whole_constellation_changed_under_a_batch_is_mended_by_another_job(fl
     assert star.underruns() == 0
 
 
+def test_commands_for_a_time_behind_a_batch_that_is_late_do_not_hold_it_up(fly):
+    star = fly([f"* {tick} inertial 0.4 0 0 0.01" for tick in range(505, 535, 5)], count=6)
+    star.run(9.9)
+    jobs = len(star.context.jobs)
+    star.job_s = 44.0  # truth from 40 s to 50 s comes at 54 s, and what is commanded meanwhile is for later
+
+    star.run(54.5, from_s=9.9)
+
+    functions = [function.__name__ for function, _ in star.context.jobs[jobs:]]
+    assert functions == ["propagate_part", "propagate_part", "propagate_vehicles"]
+    assert star.host._store.end_s == 50.0
+
+
 def test_commands_with_time_ahead_are_made_by_the_executor_and_urgent_ones_in_the_loop(fly):
     star = fly(["* 103 rtn 5 0 0.1 0", "* 110 rtn 0.2 0 0.1 0"], count=5)
     star.run(10.8)

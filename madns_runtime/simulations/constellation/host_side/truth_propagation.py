@@ -166,7 +166,7 @@ class TruthSupply:
             self._start(batch, partial(batch.parts.__setitem__, place), propagate_part, *part)
         if attitude is not None:
             self._submit_bodies(batch, np.concatenate((states[self._rigid], attitude), axis=1))
-        end_s = (first_knot + batch.knots - 1) * self.store.knot_s
+        end_s = self._batch_end_s(batch)
         commanded = [
             n
             for n, t in enumerate(self.store.timelines)
@@ -229,7 +229,8 @@ class TruthSupply:
     def _change_request(self, vehicle: int, change_s: float) -> VehicleRequest | None:
         store = self.store
         if change_s > store.end_s:
-            if self._batch is not None:
+            # What is commanded for a time behind the batch, as all is where truth is late, must not hold it up.
+            if self._batch is not None and change_s <= self._batch_end_s(self._batch):
                 self._batch.changed.add(vehicle)
             return None
         is_magnetic = vehicle in self._magnetic and store.knot_s <= ORBIT_KNOT_S_MAX
@@ -312,6 +313,9 @@ class TruthSupply:
             self._submit_vehicles(batch, changed, states, attitude)
         else:
             self._finish(batch)
+
+    def _batch_end_s(self, batch: _Batch) -> float:
+        return (batch.first_knot + batch.knots - 1) * self.store.knot_s
 
     def _batch_request(
         self, batch: _Batch, vehicle: int, states: Array, attitude: Array | None
