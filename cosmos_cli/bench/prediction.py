@@ -25,7 +25,11 @@ class CapacityPrediction:
 
 
 def predict(
-    scenario: ScenarioFile, machines: Sequence[Machine], *, per_process: int
+    scenario: ScenarioFile,
+    machines: Sequence[Machine],
+    *,
+    per_process: int,
+    host: str | None = None,
 ) -> CapacityPrediction | None:
     """
     Return what `cosmos plan` predicts for a scenario's agents on machines; None if the simulation has no demand.
@@ -34,8 +38,11 @@ def predict(
         scenario: Its number of agents does not matter.
         machines: Those of the inventory, or this computer alone.
         per_process: Agents in one process, where there are so many.
+        host: Name of the machine that runs the host, None for the operator's own.
     """
-    plan = make_plan(scenario.scenario, machines, fault_at=scenario.fault, labels=scenario.labels)
+    plan = make_plan(
+        scenario.scenario, machines, host=host, fault_at=scenario.fault, labels=scenario.labels
+    )
     demand = demand_of(scenario)
     if demand is None:
         return None

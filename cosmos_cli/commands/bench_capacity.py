@@ -154,7 +154,7 @@ def capacity(
             f"{checked.path}: in lockstep no tick is ever missed, so that any number of agents keeps the budget; try it"
             " in real time: --set time.mode=realtime"
         )
-    predicted = predict(checked, machines, per_process=per_process)
+    predicted = predict(checked, machines, per_process=per_process, host=host)
     options = run_arguments(inventory=inventory, limit=limit, host=host, settings=settings)
     options += ["--runs", str(runs_root(runs))]
     found = find_capacity(trials, checked.path, options, console.say)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -153,6 +153,15 @@ class TickTotals:
     def overrun_ratio(self) -> float | None:
         """Share of due ticks whose step overran the tolerance; None when none was due."""
         return self.overrun_errors / self.due if self.due else None
+
+
+def with_told_misses(
+    recorded: Mapping[str, AgentTicks], told: Mapping[str, int]
+) -> dict[str, AgentTicks]:
+    """Return recorded ticks with those missed that no tick followed: by agent, records of causes *told* of them alone."""
+    return {
+        name: replace(of, missed=max(of.missed, told.get(name, 0))) for name, of in recorded.items()
+    }
 
 
 def tick_totals(

@@ -114,6 +114,14 @@ class RerunOutcome:
         for alone, where in ((one.only_a, "on record"), (one.only_b, "in the rerun")):
             if alone.count:
                 told.append(f"{counted(alone.count, 'record')} only {where}")
+        for fields, where in (
+            (one.fields_only_a, "on record"),
+            (one.fields_only_b, "in the rerun"),
+        ):
+            # Software of today may record a field in another unit, or no more: its values were compared with none.
+            names = [name for name in fields if not self._is_unlike(_place_of(one.table, name))]
+            if names:
+                told.append(f"{', '.join(names)} only {where}")
         return told
 
     def _is_rounding(self, table: str, field: FieldDifference) -> bool:
@@ -168,6 +176,11 @@ class RerunOutcome:
             "not_compared": list(self.unlike),
             "diff": to_document(self.streams),
         }
+
+
+def _place_of(table: str, field: str) -> str:
+    """Return what a rerun calls a field that stands in one run alone, perhaps with its unit in parentheses."""
+    return f"{table}.{field.partition(' (')[0]}"
 
 
 def _is_of_devices_own(stream: str) -> bool:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.baseline import Baseline
 from cosmos_cli.models.loading import ScenarioFile
 from cosmos_cli.models.scenario_outline import ScenarioOutline, with_seed
@@ -16,6 +18,8 @@ from cosmos_cli.system.bounded_process import path_word
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.bounded_files import real_path
 
+MACHINES: Final = ("COSMOS_INVENTORY", "COSMOS_LIMIT")
+"""Variables that would have it run on machines: a test runs on this computer."""
 END_S: Final = 60.0
 """Beyond the waits of the run itself: start of the program, tables, package and verdict."""
 END_SHARE: Final = 0.5
@@ -69,8 +73,10 @@ class SuiteCase:
 
     @property
     def repeat_command(self) -> str:
-        """The command that repeats the run, on one line."""
-        return " ".join(map(_shell_word, ["cosmos", "run", *self.arguments()]))
+        """The command that repeats the run, on one line; on this computer, whatever inventory the environment names."""
+        named = [word for name in MACHINES if name in os.environ for word in ("-u", name)]
+        before = ["env", *named] if named else []
+        return " ".join(map(_shell_word, [*before, "cosmos", "run", *self.arguments()]))
 
 
 def _shell_word(word: str) -> str:
@@ -106,7 +112,11 @@ def make_cases(
     time = scenario.scenario.time
     if longest_s is not None and not time.is_lockstep and time.duration_s > longest_s:
         overrides = _shortened(overrides, longest_s)
-        scenario = outline.load(overrides, warn)
+        try:
+            scenario = outline.load(overrides, warn)
+        except InputError as error:
+            faults = [_of_the_cut(fault, longest_s) for fault in error.all_faults]
+            raise InputError(faults=faults, omitted=error.omitted) from None
     own_s = outline.test.deadline_s if settings.is_shortened else None
     agents = scenario.scenario.agents
     baseline = outline.baseline() if settings.is_shortened else None
@@ -125,6 +135,12 @@ def make_cases(
         )
         for seed in seeds
     ]
+
+
+def _of_the_cut(fault: Fault, longest_s: float) -> Fault:
+    """Return a fault that says who gave the value that it is about, and what to do."""
+    cut = f"of the scenario as --realtime-max {longest_s:g} cuts it; -k leaves it out"
+    return replace(fault, text=f"{fault.text} ({cut})")
 
 
 def deadline_of(scenario: ScenarioFile) -> float:

@@ -140,6 +140,10 @@ def _of_stream(
     if figure.field not in known:
         return None, f"no field {figure.field} in {figure.stream}; there are {', '.join(known)}"
     meant = {*figure.agents, *labels.labelled(figure.agents)}
+    everybody = (*agents, *table.sources)
+    nobody = [one for one in figure.agents if not _named(everybody, {one, *labels.labelled([one])})]
+    if nobody:
+        return None, f"no agent is named {', '.join(nobody)}"
     sources = _named(table.sources, meant)
     if not sources and not (figure.statistic == "count" and _named(agents, meant)):
         return None, f"nobody of {', '.join(figure.agents)} recorded {figure.stream}"

@@ -22,13 +22,12 @@ from typing import IO, Any, Final
 from cosmos_cli.launch.living_processes import LivingRun, living_runs
 from cosmos_cli.system.parent_death import end_with_parent
 from cosmos_cli.system.process_groups import signal_group
+from cosmos_cli.testing.case import MACHINES
 from madns_runtime.processes import end_process
 
 CLEAN_END_S: Final = 60.0
 """For a run that was told to end, its records and its verdict included."""
 DOCUMENT_BYTES_MAX: Final = 256 * 1024 * 1024
-MACHINES: Final = ("COSMOS_INVENTORY", "COSMOS_LIMIT")
-"""Variables that would have it run on machines: a test runs on this computer."""
 WORDS_BYTES_MAX: Final = 16_384
 """Of what a run said on stderr, its end."""
 

@@ -318,7 +318,8 @@ def test_commands_for_a_time_behind_a_batch_that_is_late_do_not_hold_it_up(fly):
     star = fly([f"* {tick} inertial 0.4 0 0 0.01" for tick in range(505, 535, 5)], count=6)
     star.run(9.9)
     jobs = len(star.context.jobs)
-    star.job_s = 44.0  # truth from 40 s to 50 s comes at 54 s, and what is commanded meanwhile is for later
+    # Truth from 40 s to 50 s comes at 54 s, and what is commanded meanwhile is for later.
+    star.job_s = 44.0
 
     star.run(54.5, from_s=9.9)
 

@@ -2,11 +2,27 @@
 
 from pathlib import Path
 
+from cosmos_cli.bench import suite
 from cosmos_cli.bench.child_run import ChildRunOutcome
 from cosmos_cli.bench.suite import ROUND_TRIPS, SUMMARY, SuiteRun
+from cosmos_cli.errors import ExitCode
 from cosmos_cli.models.loading import load_scenario
 
 SCENARIO = Path(__file__).parents[3] / "scenarios" / "thesis" / "benchmark_at_once.yaml"
+
+
+def test_a_run_that_takes_too_long_ends_no_suite_and_was_interrupted_by_nobody():
+    scenario = load_scenario(SCENARIO)
+    too_long = ChildRunOutcome(exit_code=130, is_too_long=True)
+    interrupted = ChildRunOutcome(exit_code=130, is_interrupted=True)
+
+    ends = [suite.is_the_end(each) for each in (too_long, interrupted)]
+    codes = [
+        suite.suite_exit_code([SuiteRun(scenario=scenario, outcome=each)])
+        for each in (too_long, interrupted)
+    ]
+
+    assert (ends, codes) == ([False, True], [ExitCode.RUN_FAILED, ExitCode.INTERRUPTED])
 
 
 def test_ticks_are_those_that_were_done_in_the_table_of_a_run_and_in_that_of_all():

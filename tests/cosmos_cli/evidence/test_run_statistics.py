@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from cosmos_cli.evidence.statistics import AgentTicks, TickTotals, tick_statistics, tick_totals
+from cosmos_cli.evidence.statistics import (
+    AgentTicks,
+    TickTotals,
+    tick_statistics,
+    tick_totals,
+    with_told_misses,
+)
 from madns_runtime.analysis.distribution import Distribution, summarise
 
 
@@ -71,6 +77,21 @@ def test_rejoined_agent_has_missed_the_time_between():
     totals = tick_totals({"a": agent(80)}, counters, agents=("a",), due_each=100)
 
     assert totals.missed == 20
+
+
+def test_what_an_agent_missed_last_counts_also_of_one_that_was_away_on_purpose():
+    """No tick follows these, and what ran before it was away hides them from its summary."""
+    counters = {"a": {"due": 1000, "run": 400, "missed": 100, "not_run": 500}}
+
+    totals = tick_totals(
+        with_told_misses({"a": agent(880)}, {"a": 100}),
+        counters,
+        agents=("a",),
+        due_each=1000,
+        excused=("a",),
+    )
+
+    assert (totals.run, totals.missed) == (880, 100)
 
 
 class Ticks:

@@ -55,6 +55,29 @@ def test_a_rerun_with_nothing_to_judge_is_not_the_same():
     assert verdict_of(outcomes[1]).startswith("NOTHING COMPARED")
 
 
+def test_a_field_that_one_run_alone_records_or_in_another_unit_is_a_difference():
+    counted = StreamDifference(
+        table="drive",
+        source="a",
+        rows_a=20,
+        rows_b=20,
+        matched=20,
+        fields_only_a=("odometer_m (m)", "speed_m_s"),
+        fields_only_b=("odometer_m (km)",),
+    )
+    compared = Comparison(a=None, b=None, streams=[counted])
+    found, without = (
+        RerunOutcome(devices=(), streams=compared, remarks=(), unlike=unlike)
+        for unlike in ((), ("drive.speed_m_s", "drive.odometer_m"))
+    )
+
+    assert found.differences_of(counted) == [
+        "odometer_m (m), speed_m_s only on record",
+        "odometer_m (km) only in the rerun",
+    ]
+    assert (found.is_same, without.is_same) == (False, True)
+
+
 def test_agents_that_ended_before_the_last_one_are_known_with_their_times():
     agents = {name: RecordedAgent(ticks=None, last_s=s) for name, s in (("a", 3.4), ("b", 3.3))}
 

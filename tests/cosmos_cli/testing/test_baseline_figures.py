@@ -67,7 +67,11 @@ def test_figures_of_run_json_and_of_streams_are_compared_within_their_tolerance(
         ("{stream: ticks, field: x, statistic: mean, expected: 1}", "no field x in ticks; there"),
         (
             "{stream: ticks, field: missed, statistic: mean, agents: [x], expected: 1}",
-            "nobody of x recorded ticks",
+            "no agent is named x",
+        ),
+        (
+            "{stream: ticks, field: missed, statistic: mean, agents: ['*', agnet-02], expected: 0}",
+            "no agent is named agnet-02",
         ),
         ("{path: timing.ticks}", "has no expected value: write it with cosmos test"),
         ("{path: timing.ticks, expected: 399}", "expected 399, got 400"),
@@ -154,7 +158,7 @@ def test_no_record_of_an_agent_that_there_is_counts_as_0_and_has_no_other_figure
     compared = {each.name: each for each in compare_figures(baseline(text), made.run, {})}
 
     assert (compared["all"].got, compared["other"].got) == (0, 0)
-    assert compared["nobody"].reason() == "nobody: nobody of agent-9 recorded x"
+    assert compared["nobody"].reason() == "nobody: no agent is named agent-9"
     assert compared["mean"].reason() == "mean: nobody of * recorded x"
 
 

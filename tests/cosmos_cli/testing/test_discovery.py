@@ -194,6 +194,16 @@ def test_at_full_length_nothing_is_shortened_but_real_time(folder):
     assert beta.deadline_s > 600  # from its length
 
 
+def test_what_a_cut_leaves_no_room_for_is_told_as_the_cuts(folder):
+    path = folder / "late.yaml"
+    path.write_text(
+        (folder / "a.yaml").read_text() + "timeline: [{at_s: 500, action: annotate, text: x}]\n"
+    )
+
+    with pytest.raises(InputError, match="as --realtime-max 60 cuts it; -k leaves it out"):
+        chosen(find_scenarios([path]), is_shortened=False, realtime_s_max=60.0)
+
+
 def test_a_deadline_is_the_tests_own_or_follows_from_its_length(folder):
     path = folder / "a.yaml"
     (shorter,) = chosen(find_scenarios([path])).cases

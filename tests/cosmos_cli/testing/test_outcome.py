@@ -65,6 +65,15 @@ def test_the_scenarios_own_seed_is_in_the_command_that_repeats_it():
     assert make_case(seed=11).repeat_command == "cosmos run s.yaml --set seed=11"
 
 
+def test_what_repeats_a_run_does_so_on_this_computer_as_the_test_did(monkeypatch):
+    monkeypatch.setenv("COSMOS_INVENTORY", "tower.yaml")
+    monkeypatch.delenv("COSMOS_LIMIT", raising=False)
+
+    told = make_case(seed=11).repeat_command
+
+    assert told == "env -u COSMOS_INVENTORY cosmos run s.yaml --set seed=11"
+
+
 def test_a_run_that_was_cut_by_ctrl_c_did_not_fail():
     cut = make_result(130)
     assert judged(result=cut, is_interrupted=True).outcome == "interrupted"
