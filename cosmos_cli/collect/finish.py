@@ -40,7 +40,12 @@ from cosmos_cli.evidence.run_documents import (
     problems_of_run,
 )
 from cosmos_cli.evidence.run_json import Evidence
-from cosmos_cli.evidence.statistics import clock_statistics, round_trip_statistics, tick_statistics
+from cosmos_cli.evidence.statistics import (
+    clock_statistics,
+    round_trip_statistics,
+    tick_statistics,
+    with_told_misses,
+)
 from cosmos_cli.evidence.table_labels import TableLabels
 from cosmos_cli.evidence.tables import open_tables
 from cosmos_cli.evidence.tabulate import Gathered, Progress, gather
@@ -242,6 +247,10 @@ def _evidence(
         _unretrieved(sources, end.problems),
         recorded_files(run, plan, end.result),
     )
+    causes = recorded_causes(tables.get("late_ticks"))
+    ticks = tick_statistics(
+        tables.get("ticks"), config.deadline.overrun_ms if config is not None else None
+    )
     return Evidence(
         run=run.name,
         started=run.read_json(run.run_json) or {},
@@ -254,10 +263,8 @@ def _evidence(
         interrupted=end.interrupted,
         problems=end.problems,
         scans=gathered.scans,
-        ticks=tick_statistics(
-            tables.get("ticks"), config.deadline.overrun_ms if config is not None else None
-        ),
-        recorded_causes=recorded_causes(tables.get("late_ticks")),
+        ticks=with_told_misses(ticks, {name: of.missed for name, of in causes.items()}),
+        recorded_causes=causes,
         round_trip_ms=round_trip_statistics(tables),
         clock=clock_statistics(tables.get("clock")),
         missing=(*missing, *gathered.faults),

@@ -25,13 +25,7 @@ from cosmos_cli.evidence.plugin_checks import plugin_checks
 from cosmos_cli.evidence.remarks import Declared, result_remarks, undeclared_remarks
 from cosmos_cli.evidence.run_directory import SCHEMA
 from cosmos_cli.evidence.run_documents import Problem, text_or_none
-from cosmos_cli.evidence.statistics import (
-    TickStatistics,
-    TickTotals,
-    tick_totals,
-    with_told_misses,
-    worst_sources,
-)
+from cosmos_cli.evidence.statistics import TickStatistics, TickTotals, tick_totals, worst_sources
 from cosmos_cli.evidence.streams import StreamScan
 from cosmos_cli.evidence.table_labels import time_zero_remarks
 from cosmos_cli.evidence.tick_causes import AgentCauses, CauseTotals, cause_totals, told_causes
@@ -99,9 +93,8 @@ class Evidence:
         is_complete = self.result is not None and self.result.get("status") == "complete"
         due_each = self._ticks_due() if is_complete else None
         lost = self._lost()
-        told = {name: of.missed for name, of in self.recorded_causes.items()}
         return tick_totals(
-            with_told_misses(self.ticks.agents, told),
+            self.ticks.agents,
             self._of_agents("ticks"),
             agents=names,
             due_each=due_each,

@@ -155,13 +155,13 @@ class TickTotals:
         return self.overrun_errors / self.due if self.due else None
 
 
-def with_told_misses(
-    recorded: Mapping[str, AgentTicks], told: Mapping[str, int]
-) -> dict[str, AgentTicks]:
-    """Return recorded ticks with those missed that no tick followed: by agent, records of causes *told* of them alone."""
-    return {
-        name: replace(of, missed=max(of.missed, told.get(name, 0))) for name, of in recorded.items()
+def with_told_misses(found: TickStatistics, told: Mapping[str, int]) -> TickStatistics:
+    """Return statistics with the missed ticks that no other followed, too: by agent, records of causes *told* them alone."""
+    agents = {
+        name: replace(of, missed=max(of.missed, told.get(name, 0)))
+        for name, of in found.agents.items()
     }
+    return replace(found, agents=agents)
 
 
 def tick_totals(

@@ -53,7 +53,13 @@ def across_deg_s(folder, agent):
 
 
 def flown_share(document, folder, agent):
-    """Return the share of the run's ticks that the agent had and its computer, if it has one, was told of."""
+    """
+    Return the share of the run's ticks that the agent had and its computer, if it has one, was told of.
+
+    Where a busy machine was late with truth it is 0: nobody flew by what was so.
+    """
+    if document["simulation"]["host"]["truth_late"]:
+        return 0.0
     ticks = len(records(folder, "ticks", agent))
     if agent in COMPUTERS:
         ticks = min(ticks, document["simulation"]["agents"][agent]["flight"]["ticks_sent"])

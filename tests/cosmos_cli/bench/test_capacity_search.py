@@ -12,6 +12,7 @@ from cosmos_cli.bench.capacity import SCENARIO, CapacityFound, CapacityTrials, f
 from cosmos_cli.bench.child_run import ChildRunOutcome
 from cosmos_cli.bench.prediction import predict
 from cosmos_cli.bench.search import CapacitySearch
+from cosmos_cli.commands.fleet_command import some_machines
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.loading import load_scenario
@@ -231,6 +232,21 @@ def test_search_whose_time_is_over_has_found_what_held_until_then(monkeypatch):
 
     assert (found.stopped_by, found.words) == ("the time is over", "at least 8 agents keep it")
     assert found.exit_code == ExitCode.OK
+
+
+def test_the_prediction_is_of_the_machine_that_runs_the_host_as_cosmos_plan_has_it(tmp_path):
+    path = tmp_path / "tower.yaml"
+    path.write_text("all: {hosts: {m1: {ansible_host: 10.0.0.1}, m2: {ansible_host: 10.0.0.2}}}\n")
+    machines = some_machines([str(path)], None, "m1")
+    scenario = load_scenario(
+        SCENARIO, ["agents.count=8", "agents.tick_hz=100", "plan.step_s=0.002"]
+    )
+
+    elsewhere, on_board = (
+        predict(scenario, machines, per_process=1, host=host).agents for host in (None, "m1")
+    )
+
+    assert 0 < on_board < elsewhere
 
 
 @pytest.mark.parametrize("per_process", [1, 8, 50])

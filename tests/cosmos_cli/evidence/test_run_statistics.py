@@ -3,6 +3,7 @@ import pytest
 
 from cosmos_cli.evidence.statistics import (
     AgentTicks,
+    TickStatistics,
     TickTotals,
     tick_statistics,
     tick_totals,
@@ -81,10 +82,11 @@ def test_rejoined_agent_has_missed_the_time_between():
 
 def test_what_an_agent_missed_last_counts_also_of_one_that_was_away_on_purpose():
     """No tick follows these, and what ran before it was away hides them from its summary."""
+    recorded = TickStatistics(agents={"a": agent(880)}, lateness_ms={}, margin_ms={})
     counters = {"a": {"due": 1000, "run": 400, "missed": 100, "not_run": 500}}
 
     totals = tick_totals(
-        with_told_misses({"a": agent(880)}, {"a": 100}),
+        with_told_misses(recorded, {"a": 100}).agents,
         counters,
         agents=("a",),
         due_each=1000,
