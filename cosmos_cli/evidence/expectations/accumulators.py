@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Places = NDArray[np.int64]
 P99 = 0.99
+TIMES_KEPT = 4096
+"""Times within bounds, the earliest: of more than so many that come late, settled may be too late."""
 OCCURRENCES_KEPT = 100_000
 """Times of an event that are kept, the first ones; the others are counted."""
 
@@ -252,22 +254,39 @@ class FirstTime(Accumulator):
 
 
 class Settled(Accumulator):
-    """The time from which on the value stays within bounds until its last record."""
+    """
+    The time from which on the value stays within bounds until the last record, by their times.
+
+    Records of one time follow each other as they were recorded. Some come late, such as a maneuver's, which is on record
+    once truth holds it: times within bounds are kept until none can come before them.
+    """
 
     def __init__(self, when: ValueBounds) -> None:
         self._when = when
-        self._since_s: float | None = None
+        self._outside = (-math.inf, -1)
+        """Time and place of the last one outside."""
+        self._t_s: Floats = np.empty(0)
+        """Times behind it, in order, and their places."""
+        self._places: Places = np.empty(0, np.int64)
 
     def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
-        outside = np.flatnonzero(~holds(self._when, values))
-        if len(outside):
-            after = int(outside[-1]) + 1
-            self._since_s = float(t_s[after]) if after < len(t_s) else None
-        elif self._since_s is None:
-            self._since_s = float(t_s[0])
+        within = holds(self._when, values)
+        if not within.all():
+            outside = ~within
+            last = np.lexsort((places[outside], t_s[outside]))[-1]
+            found = float(t_s[outside][last]), int(places[outside][last])
+            self._outside = max(self._outside, found)
+        all_s = np.concatenate((self._t_s, t_s[within]))
+        their = np.concatenate((self._places, places[within]))
+        last_s, last_place = self._outside
+        behind = (all_s > last_s) | ((all_s == last_s) & (their > last_place))
+        all_s, their = all_s[behind], their[behind]
+        order = np.lexsort((their, all_s))[:TIMES_KEPT]
+        self._t_s, self._places = all_s[order], their[order]
 
     def _found_now(self) -> Found:
-        return self._since_s, self._since_s
+        since_s = float(self._t_s[0]) if len(self._t_s) else None
+        return since_s, since_s
 
 
 class Occurrences(Accumulator):

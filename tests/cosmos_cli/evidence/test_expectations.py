@@ -168,6 +168,33 @@ def test_first_time_and_settled_are_times_of_records(rows, monkeypatch):
     assert (first.unit, settled.unit) == ("s", "s")
 
 
+@pytest.mark.parametrize("rows", [1, 2, 65_536])
+@pytest.mark.parametrize(
+    ("t_s", "values", "settled_s"),
+    [
+        ([80, 100, 90], [1, -1, 1], None),  # what comes last is of before the one outside
+        ([80, 100, 90, 110], [1, -1, 1, 1], 110),
+        ([80, 110, 90, 95], [-1, 1, -1, 1], 95),
+        ([80, 80, 80], [-1, 1, 1], 80),
+        ([80, 80, 80], [1, 1, -1], None),
+    ],
+)
+def test_settled_goes_by_the_times_of_records_however_late_they_come(
+    t_s, values, settled_s, rows, monkeypatch
+):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    columns = {"t_s": np.array(t_s, float), "x_m": np.array(values, float)}
+    state = FakeTable("state", STATE.fields, {"a": columns})
+    within = ValueBounds(low=0.0)
+
+    (result,) = judge(
+        expect(statistic="settled", when=within, bounds=ValueBounds.below(1e3), agents=("a",)),
+        tables={"state": state},
+    ).results
+
+    assert result.got == settled_s
+
+
 def test_the_worst_agent_is_told_with_its_time_in_the_unit_of_the_check():
     worst = {name: np.abs(values).max() for name, values in DATA.items()}
     agent = max(worst, key=worst.get)
