@@ -16,8 +16,8 @@ SAME = f"{SAME_BENCHMARKS} or orbits_1h or orbits_4h or orbits_6min or guidance_
 """In real time a minute of these is the same as of what they extend; shortened, the others are in lockstep."""
 REALTIME_MAX_S = 70
 """Until the latest check of any of them has begun."""
-ALONE = "starlink1000"
-"""It wants all processors of a small machine; benchmarks/scale.py flies it."""
+ALONE = "starlink1000 or planet93_100hz"
+"""They want all processors of a small machine; benchmarks/scale.py flies them."""
 NIGHTLY = f"not (hardware or emulator or {ALONE} or {SAME})"
 
 
