@@ -213,8 +213,7 @@ def find_capacity(
 
 def _take_end(found: CapacityFound, outcome: ChildRunOutcome, trials: CapacityTrials) -> bool:
     """Return whether the search goes on after a run."""
-    is_ended = outcome.exit_code == ExitCode.INTERRUPTED and not outcome.is_too_long
-    if outcome.is_interrupted or is_ended:
+    if outcome.is_last:
         found.stopped_by, found.exit_code = "interrupted", ExitCode.INTERRUPTED
     elif outcome.exit_code == ExitCode.MACHINES and trials.is_machines_fault:
         words = outcome.document.get("verdict") or outcome.last_words or "machines failed"

@@ -41,6 +41,12 @@ class ChildRunOutcome:
     """Whether it was told to end, or killed, after its limit."""
 
     @property
+    def is_last(self) -> bool:
+        """Whether somebody interrupted it, so that no other is to follow; one that took too long was ended here."""
+        ended = self.exit_code == ExitCode.INTERRUPTED and not self.is_too_long
+        return self.is_interrupted or ended
+
+    @property
     def run(self) -> str:
         """The run's name; empty if there was none."""
         return str(self.document.get("run") or "")

@@ -207,15 +207,9 @@ def run_suite(
             console.say(outcome.last_words)
         console.data(f"{outcome.run or scenario.path}: {document.get('verdict') or 'no verdict'}")
         console.data("")
-        if is_the_end(outcome):
+        if outcome.is_last:
             break
     return done
-
-
-def is_the_end(outcome: ChildRunOutcome) -> bool:
-    """Whether somebody interrupted a run; that one which takes too long ends so is no reason to leave out the others."""
-    ended = outcome.exit_code == ExitCode.INTERRUPTED and not outcome.is_too_long
-    return outcome.is_interrupted or ended
 
 
 def _with_benchmark(outcome: ChildRunOutcome, runs: Path, console: Console) -> Mapping[str, Any]:
@@ -226,7 +220,7 @@ def _with_benchmark(outcome: ChildRunOutcome, runs: Path, console: Console) -> M
 
 def suite_exit_code(done: Sequence[SuiteRun]) -> int:
     """Return that of the interruption, else of the first run that did not end well."""
-    if any(each.outcome.is_interrupted for each in done):
+    if any(each.outcome.is_last for each in done):
         return int(ExitCode.INTERRUPTED)
     codes = [-1 if each.outcome.is_too_long else each.outcome.exit_code for each in done]
     bad = [code if code > 0 else int(ExitCode.RUN_FAILED) for code in codes if code]

@@ -272,10 +272,12 @@ class Settled(Accumulator):
     def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         within = holds(self._when, values)
         if not within.all():
-            outside = ~within
-            last = np.lexsort((places[outside], t_s[outside]))[-1]
-            found = float(t_s[outside][last]), int(places[outside][last])
+            outside_s, their = t_s[~within], places[~within]
+            last_s = outside_s.max()
+            found = float(last_s), int(their[outside_s == last_s].max())
             self._outside = max(self._outside, found)
+        elif len(self._t_s) == TIMES_KEPT and t_s.min() > self._t_s[-1]:
+            return  # behind all that are kept, as most of a long run are
         all_s = np.concatenate((self._t_s, t_s[within]))
         their = np.concatenate((self._places, places[within]))
         last_s, last_place = self._outside

@@ -16,7 +16,7 @@ def test_a_run_that_takes_too_long_ends_no_suite_and_was_interrupted_by_nobody()
     too_long = ChildRunOutcome(exit_code=130, is_too_long=True)
     interrupted = ChildRunOutcome(exit_code=130, is_interrupted=True)
 
-    ends = [suite.is_the_end(each) for each in (too_long, interrupted)]
+    ends = [each.is_last for each in (too_long, interrupted)]
     codes = [
         suite.suite_exit_code([SuiteRun(scenario=scenario, outcome=each)])
         for each in (too_long, interrupted)
