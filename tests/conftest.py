@@ -16,6 +16,8 @@ from harness.warm_commands import WarmCommands
 from harness.wheel_cache import VARIABLE
 from hypothesis import HealthCheck, settings
 
+from cosmos_cli.ui import invocation
+
 pytest_plugins = ["tower.fixtures"]  # of tests/tower; costs nothing where no test asks for a tower
 
 # A shell's background jobs ignore Ctrl-C, and so would every command that a test interrupts.
@@ -129,6 +131,13 @@ def is_importing():
     while frame and not frame.f_code.co_filename.startswith("<frozen importlib"):
         frame = frame.f_back
     return frame is not None
+
+
+@pytest.fixture(autouse=True)
+def command_line_forgotten():
+    """Forget the command line that a test carried out in this process: messages name the machines of the one under way."""
+    yield
+    invocation.forget()
 
 
 @pytest.fixture(autouse=True)

@@ -157,6 +157,10 @@ class LocalChild:
         """Return who of its group lives."""
         return living_members(self.pid)
 
+    def members_age_s(self) -> float:
+        """Return how old that answer is: it is looked up as it is asked for."""
+        return 0.0
+
     def terminate(self) -> None:
         """Close its standard input and send its whole group SIGTERM."""
         self._channel.close_writing()

@@ -23,6 +23,8 @@ GROUP_GRACE_S = 5.0
 """Time for what a dead child has left in its group: agents and workers end by themselves within it."""
 KILL_WAIT_S = 5.0
 """Time for the kernel to carry out a SIGKILL; a process that hangs in a device outlives it."""
+GROUP_ANSWER_S = 30.0
+"""Time beyond that for a busy machine to answer who of the group lives."""
 GROUP_CHECK_S = 0.1
 
 
@@ -104,8 +106,8 @@ class Children:
         self._agenda.after(f"end {child.name}", wait_s, partial(self.end, child, late))
 
     def end(self, child: ChildRecord, late: str) -> None:
-        """SIGTERM now, SIGKILL after a grace; *late* says what it failed to do."""
-        if child.has_ended:
+        """SIGTERM now, SIGKILL after a grace; *late* says what it failed to do. What a dead leader has left has its own."""
+        if child.has_exited:
             return
         self._agenda.problem(f"{child} {late}: it is being ended", child.machine)
         self._agenda.do(Terminate(child.name))
@@ -152,14 +154,23 @@ class Children:
             child.has_ended = True
             self._agenda.cancel(f"end {child.name}")
             return
-        if self._agenda.now_s >= child.group_until_s and not child.is_killed:
-            self.kill(child, f"left {len(event.pids)} running that should have ended with it")
+        if not child.is_killed and (known := self._stayed(child, event.age_s)) is not None:
+            self.kill(
+                child, f"left {len(event.pids)} running that should have ended with it{known}"
+            )
         if not child.has_ended:
             self._agenda.after(
                 f"group {child.name}",
                 GROUP_CHECK_S,
                 partial(self._agenda.do, LookAtGroup(child.name)),
             )
+
+    def _stayed(self, child: ChildRecord, age_s: float) -> str | None:
+        """Tell whether somebody has stayed too long, by an answer asked since then or by none in time; None if not."""
+        over_s = self._agenda.now_s - child.group_until_s
+        if over_s >= age_s:
+            return ""
+        return f", as known {age_s:.0f} s ago" if over_s >= GROUP_ANSWER_S else None
 
     def abandon(self, child: ChildRecord) -> None:
         """Take a child for ended: its machine is lost, and nothing can be done from here."""

@@ -325,8 +325,9 @@ class Operator:
         child.kill()
 
     def _look_at_group(self, action: actions.LookAtGroup) -> None:
-        members = tuple(self._children[action.name].members())
-        self._post(happened.GroupSeen(action.name, members))
+        child = self._children[action.name]
+        members, age_s = tuple(child.members()), child.members_age_s()
+        self._post(happened.GroupSeen(action.name, members, age_s))
 
     def _close_child(self, action: actions.CloseChild) -> None:
         self._exited.add(action.name)

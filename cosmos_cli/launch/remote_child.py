@@ -16,10 +16,8 @@ from typing import Any
 import orjson
 
 from cosmos_cli.fleet.connection import Stream
-from cosmos_cli.fleet.failure import FailureKind, MachineFailure
-from cosmos_cli.fleet.liveness import BlockingStream
+from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.launch.background import BackgroundTasks
-from cosmos_cli.launch.channel import READ_BYTES
 from cosmos_cli.launch.child import (
     STDERR_BYTES,
     STDERR_LINES,
@@ -30,6 +28,7 @@ from cosmos_cli.launch.child import (
 from cosmos_cli.launch.events import ProcessKnown, parse_event
 from cosmos_cli.launch.machines import RemoteMachine
 from cosmos_cli.launch.remote_line import RemoteLine
+from cosmos_cli.launch.remote_stream import STARTED_ANEW, fate_of, reach_again, start_program
 from cosmos_cli.launch.run_events import (
     LineBroke,
     Reattached,
@@ -38,23 +37,13 @@ from cosmos_cli.launch.run_events import (
     SignalUndelivered,
 )
 from cosmos_cli.system.bounded_process import describe_exit
-from madns_runtime.config import RELAY_CONNECTED, RELAY_NOBODY
 from madns_runtime.plugin.host_calls import interrupted_call, page_path
 
-STATUS_TRIES = 10
-STATUS_TIMEOUT_S = 1.0
-STATUS_PAUSE_S = 0.1
-"""A program's exit status comes a moment after the end of its output."""
 KILL_TIMEOUT_S = 4.0
-LAUNCH_TIMEOUT_S = 20.0
-RELAY_TIMEOUT_S = 5.0
-RELAY_TALK_BYTES_MAX = 65_536
-"""A start-up file there may talk before the relay does."""
 NO_STATUS = "ended, and nobody knows how"
 ENDED_CUT = "ended as the connection to it broke"
 SAID_CHARACTERS_MAX = 300
 """Characters shown of a last line that tells why it could not be started."""
-STARTED_ANEW = "it has started anew"
 
 
 class RemoteChild:
@@ -106,8 +95,10 @@ class RemoteChild:
         self._no_status = NO_STATUS
         self._members: list[int] = []
         self._is_asking = False
+        self._asked_s = self._known_s = time.monotonic()
         background.submit(
-            partial(_start, machine, start_command(program, machine.paths), launch), self._opened
+            partial(start_program, machine, start_command(program, machine.paths), launch),
+            self._opened,
         )
 
     @property
@@ -168,9 +159,13 @@ class RemoteChild:
     def members(self) -> list[int]:
         """Return who of its group lived when that was asked last, and ask again."""
         if self.pid is not None and not self._is_asking and not self._is_closed:
-            self._is_asking = True
+            self._is_asking, self._asked_s = True, time.monotonic()
             self._ask("group", self._group(), self._answered)
         return list(self._members)
+
+    def members_age_s(self) -> float:
+        """Return how long ago the question was put that `members` told the answer to."""
+        return time.monotonic() - self._known_s
 
     def terminate(self) -> None:
         """Close its standard input and send its whole group SIGTERM."""
@@ -237,7 +232,7 @@ class RemoteChild:
             "seen": self._line.seen,
         }
         task = partial(
-            _reattach,
+            reach_again,
             self._machine,
             relay_command(self._program, self._incarnation, self._machine.paths),
             orjson.dumps(attach) + b"\n",
@@ -295,7 +290,7 @@ class RemoteChild:
             self._broke(failure.text)
         else:
             self._background.submit(
-                partial(_fate, stream, self._machine), partial(self._fate_known, stream)
+                partial(fate_of, stream, self._machine), partial(self._fate_known, stream)
             )
 
     def _fate_known(
@@ -339,7 +334,7 @@ class RemoteChild:
         return {"group": self.pid, "directory": self._program.run_directory}
 
     def _answered(self, members: Sequence[int] | None, failure: MachineFailure | None) -> None:
-        self._is_asking = False
+        self._is_asking, self._known_s = False, self._asked_s
         if members is not None:
             self._members = list(members)
         elif self._has_exited:
@@ -348,51 +343,3 @@ class RemoteChild:
     def _signalled(self, members: Any, failure: MachineFailure | None) -> None:
         if failure is not None and self.loss is None:
             self._tell(SignalUndelivered(self._machine.name))
-
-
-def _start(machine: RemoteMachine, command: str, launch: Mapping[str, Any]) -> Stream:
-    """Start a program there and hand over its launch line, which may be long."""
-    stream = machine.connection.open(command)
-    try:
-        BlockingStream(stream).write_all(orjson.dumps(launch) + b"\n", timeout_s=LAUNCH_TIMEOUT_S)
-    except MachineFailure as failure:
-        if failure.kind is not FailureKind.LOST:  # of one that has ended, its output tells why
-            stream.close()
-            raise
-    return stream
-
-
-def _reattach(machine: RemoteMachine, command: str, attach: bytes) -> tuple[Stream, bytes] | None:
-    """Return a new line to a program and what came over it; None if no program waits there."""
-    machine.connect_again()
-    stream = machine.connection.open(command)
-    link = BlockingStream(stream)
-    try:
-        said = b""
-        while RELAY_CONNECTED not in said:
-            data = link.read_some(READ_BYTES, timeout_s=RELAY_TIMEOUT_S)
-            if not data or len(said) > RELAY_TALK_BYTES_MAX:
-                if _fate(stream, machine)[0] == RELAY_NOBODY:
-                    stream.close()
-                    if machine.has_started_anew():
-                        raise MachineFailure(FailureKind.LOST, STARTED_ANEW)
-                    return None
-                raise MachineFailure(FailureKind.LOST, f"no relay: {link.ending().errors}")
-            said += data
-        link.write_all(attach, timeout_s=RELAY_TIMEOUT_S)
-    except BaseException:
-        stream.close()
-        raise
-    return stream, said.partition(RELAY_CONNECTED)[2]
-
-
-def _fate(stream: Stream, machine: RemoteMachine) -> tuple[int | None, bool]:
-    """Return the exit status of a program whose output has ended, and whether its machine answers."""
-    for _ in range(STATUS_TRIES):
-        status = stream.ending(timeout_s=STATUS_TIMEOUT_S).exit_status
-        if status is not None:
-            return status, True
-        if not machine.is_alive():
-            return None, False
-        time.sleep(STATUS_PAUSE_S)
-    return None, True

@@ -94,6 +94,8 @@ class GroupSeen:
 
     name: str
     pids: tuple[int, ...]
+    age_s: float = 0.0
+    """How long ago that was asked; what a machine has not answered yet is told as it was known last."""
 
 
 @dataclass(frozen=True, slots=True)

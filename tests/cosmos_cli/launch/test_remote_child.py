@@ -106,10 +106,10 @@ def test_program_that_is_gone_behind_a_broken_connection_is_told_as_such(
 ):
     made = started(str(tmp_path / "runs" / "0001-c"))
     monkeypatch.setattr(
-        "cosmos_cli.launch.remote_child._fate", lambda stream, machine: (None, False)
+        "cosmos_cli.launch.remote_child.fate_of", lambda stream, machine: (None, False)
     )
     wait_for(made, lambda: any(isinstance(event, LineBroke) for event in made.told))
-    monkeypatch.setattr("cosmos_cli.launch.remote_child._reattach", lambda *_: None)
+    monkeypatch.setattr("cosmos_cli.launch.remote_child.reach_again", lambda *_: None)
 
     made.child.reattach()
     wait_for(made, made.child.has_exited)
@@ -152,12 +152,12 @@ def test_program_that_has_not_greeted_over_a_new_line_is_not_taken_for_ended(
     """It turns away whoever does not introduce themselves in time, as over a connection that stands still, and lives on."""
     made = started(str(tmp_path / "runs" / "0001-c"))
     monkeypatch.setattr(
-        "cosmos_cli.launch.remote_child._fate", lambda stream, machine: (None, False)
+        "cosmos_cli.launch.remote_child.fate_of", lambda stream, machine: (None, False)
     )
     wait_for(made, lambda: any(isinstance(event, LineBroke) for event in made.told))
     made.told.clear()
-    monkeypatch.setattr("cosmos_cli.launch.remote_child._fate", lambda stream, machine: (0, True))
-    monkeypatch.setattr("cosmos_cli.launch.remote_child._reattach", lambda *_: (Relay(said), b""))
+    monkeypatch.setattr("cosmos_cli.launch.remote_child.fate_of", lambda stream, machine: (0, True))
+    monkeypatch.setattr("cosmos_cli.launch.remote_child.reach_again", lambda *_: (Relay(said), b""))
 
     made.child.reattach()
     wait_for(
@@ -174,7 +174,7 @@ def test_end_of_a_line_that_another_one_has_replaced_is_none_of_the_program(
     """The program closes the old line for the new one: what became of the old one may be known later than that."""
     made = started(str(tmp_path / "runs" / "0001-c"))
     monkeypatch.setattr(
-        "cosmos_cli.launch.remote_child._fate", lambda stream, machine: (None, False)
+        "cosmos_cli.launch.remote_child.fate_of", lambda stream, machine: (None, False)
     )
     wait_for(made, lambda: any(isinstance(event, LineBroke) for event in made.told))
     greeting = b'{"event": "attached", "commands": 0}\n'
@@ -186,8 +186,8 @@ def test_end_of_a_line_that_another_one_has_replaced_is_none_of_the_program(
         is_replaced.wait(60.0)
         return 0, True
 
-    monkeypatch.setattr("cosmos_cli.launch.remote_child._fate", fate)
-    monkeypatch.setattr("cosmos_cli.launch.remote_child._reattach", lambda *_: (next(lines), b""))
+    monkeypatch.setattr("cosmos_cli.launch.remote_child.fate_of", fate)
+    monkeypatch.setattr("cosmos_cli.launch.remote_child.reach_again", lambda *_: (next(lines), b""))
     made.child.reattach()
     wait_for(made, lambda: asked)
     made.told.clear()

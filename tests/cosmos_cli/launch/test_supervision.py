@@ -12,7 +12,13 @@ import pytest
 from cosmos_cli.launch import actions, events
 from cosmos_cli.launch import run_events as happened
 from cosmos_cli.launch.actions import Action
-from cosmos_cli.launch.children import GROUP_GRACE_S, HOST, KILL_WAIT_S, TERM_GRACE_S
+from cosmos_cli.launch.children import (
+    GROUP_ANSWER_S,
+    GROUP_GRACE_S,
+    HOST,
+    KILL_WAIT_S,
+    TERM_GRACE_S,
+)
 from cosmos_cli.launch.host_limits import HOST_SILENCE_S, MARGIN_S
 from cosmos_cli.launch.machine_watch import REATTACH_INTERVAL_S, RETURN_INTERVAL_S, SILENCE_S
 from cosmos_cli.launch.request import LaunchRequest, SupervisorStart
@@ -259,6 +265,47 @@ def test_members_that_a_dead_leader_leaves_are_killed_after_a_grace(here: Table)
     assert kill == actions.Kill(HOST, "left 1 running that should have ended with it")
     here.play((0, GroupSeen(HOST, ())))
     assert here.supervision.has_ended(HOST)
+
+
+def kills_of_host(table: Table) -> list[actions.Kill]:
+    return [kill for kill in of_kind(table.done, actions.Kill) if kill.name == HOST]
+
+
+def test_dead_leader_is_not_told_late_while_its_machine_has_not_answered_who_of_its_group_lives(
+    here: Table,
+) -> None:
+    here.play((1, ChildSaid(HOST, events.Finished({"status": "complete"}))))
+    here.play((0, ChildExited(HOST, "ended", 0)), (0, GroupSeen(HOST, ())))
+    here.play((0, exited("agent-01", is_abnormal=False)), (0, ChildExited(AGENTS, "ended", 0)))
+
+    here.play((20, GroupSeen(AGENTS, (20,), age_s=21)), (1, GroupSeen(AGENTS, ())))
+
+    assert problems(here.done) == []
+    assert here.supervision.is_over
+
+
+def test_nobody_is_taken_for_left_by_what_a_busy_machine_told_before_the_grace_was_over(
+    here: Table,
+) -> None:
+    here.play((0, ChildExited(HOST, "ended", 0)))
+    for late_s in range(1, 20):
+        here.play((1, GroupSeen(HOST, (10,), age_s=late_s + 0.5)))
+    here.play((1, GroupSeen(HOST, ())))
+
+    assert kills_of_host(here) == []
+    assert here.supervision.has_ended(HOST)
+
+
+def test_members_are_killed_of_whom_a_machine_answers_nothing_new(here: Table) -> None:
+    here.play((0, ChildExited(HOST, "ended", 0)))
+    over_s = GROUP_GRACE_S + GROUP_ANSWER_S
+
+    here.play((over_s - 0.1, GroupSeen(HOST, (10,), age_s=over_s)))
+    assert kills_of_host(here) == []
+    here.play((0.1, GroupSeen(HOST, (10,), age_s=over_s)))
+
+    (kill,) = kills_of_host(here)
+    assert kill.why == "left 1 running that should have ended with it, as known 35 s ago"
 
 
 def test_host_that_died_is_told_with_its_last_call(here: Table) -> None:
