@@ -27,7 +27,7 @@ import numpy as np
 from star_transports import TRANSPORTS, Client
 
 from madns_runtime.health.probe import pss_bytes
-from madns_runtime.realtime.packs import split_into_packs
+from madns_runtime.timing.pack_split import split_into_packs
 from madns_runtime.timing.rate import stagger
 
 PACKET = struct.Struct("<IId")

@@ -1,9 +1,8 @@
 """
 Settings of a run as frozen dataclasses that travel as plain mappings.
 
-The sections are also what a person writes in a scenario: the operator's side validates the same
-classes through pydantic (the bounds are `annotated_types`), so that a new setting has one home.
-Agents read them back with `from_mapping` (madns_runtime.plain_values) and never need pydantic.
+The sections are also what a person writes in a scenario: the operator's side validates the same classes through pydantic (the
+bounds are `annotated_types`), so that a new setting has one home. Agents read them back with `from_mapping`, without pydantic.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ class Agents(ScenarioSection):
     """Number of times an agent that died is started again (with on_agent_loss: continue)."""
 
     def resolved_names(self) -> tuple[str, ...]:
-        """Return one name an agent, in order."""
+        """Return the name of each agent, in order."""
         return self.names or _numbered_names(self.count)
 
 
@@ -363,8 +362,7 @@ class Launch:
     run_key_hex: Annotated[str, MinLen(64)] = field(repr=False)
     session_hex: str
     directory: str
-    """Folder to record in: of the host, host/ of the run directory; of agents the run directory here, of which
-    they take agents/<name>/, and the machine's health machines/<machine>/."""
+    """Folder to record in: of the host, host/ of the run's; of agents the run's, with agents/<name>/, machines/<machine>/."""
     is_detached: bool = False
     """The operator leaves while the run goes on: the end of standard input is no end."""
     reattach_s: Annotated[float, Ge(0)] = 0.0
@@ -386,6 +384,8 @@ class AgentLaunch(Launch):
     """Name of this machine in the inventory."""
     agents: tuple[str, ...]
     """Names of the agents to run here."""
+    packs_elsewhere: tuple[int, int] | None = None
+    """Packs of agents on machines before this one and behind it, where several agents share a process; None: all agents are here."""
     host_address: str
     host_port: int
     life: Annotated[int, Ge(1)] = 1

@@ -20,9 +20,8 @@ from typing import Any
 from cosmos_cli.launch.feasibility import COUNT_MAX, IP_UDP_BYTES, Resources, finite, judge
 from cosmos_cli.models.scenario import Scenario
 from madns_runtime.plugin.api import Demand
+from madns_runtime.timing.pack_split import PACK_AGENTS_MAX
 
-PACK_AGENTS_MAX = 8
-"""Agents of a process that share a deadline, and so a wake-up."""
 SHARE_USABLE = 0.8
 """Usable share of a processor: above, ticks wait for each other more often than budgets of missed ticks allow."""
 SKB_OVERHEAD_BYTES, SKB_TAIL_BYTES, SKB_HEADER_BYTES = 256, 320, 64

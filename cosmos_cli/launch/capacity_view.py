@@ -3,39 +3,61 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
+from cosmos_cli.fleet.target import target_of
 from cosmos_cli.launch.capacity import Capacity, ComputerFacts
 from cosmos_cli.launch.plan import LaunchPlan
+from cosmos_cli.models.inventory import Machine
 from cosmos_cli.ui.console import Column, Console
 from madns_runtime.lockstep.partition import processors_here
 
 BOARD_PROCESSORS = 4
 """Processors of a machine that nobody has asked yet: those of a Raspberry Pi since its second model."""
+HERE_NAME = "this computer"
 LIMITS = (Column("limit"), Column("agents at most", is_number=True), Column("why"))
+
+
+class _Place(NamedTuple):
+    """What tells one computer from another without asking it."""
+
+    address: str
+    port: int | None
+
+    @classmethod
+    def of(cls, machine: Machine | None) -> _Place:
+        """Return where a machine is; None is the operator's own."""
+        if machine is None or machine.connection == "local":
+            return HERE
+        target = target_of(machine)
+        return cls(target.address, target.port)
+
+
+HERE = _Place("", None)
 
 
 def computers_of(plan: LaunchPlan) -> list[ComputerFacts]:
     """
-    Return the computers of a plan: those that are told of, as many processors as are known here.
+    Return the computers of a plan, as many agents as they may run: as many processors as are known here.
 
-    Machines of one address are one computer. No machine is asked: another one counts with the processors of a
+    Machines of one address and port are one computer. No machine is asked: another one counts with the processors of a
     Raspberry Pi, and with speed 1.
     """
-    here = "this computer"
-    found: dict[str, tuple[bool, bool]] = {}
-    host = here if plan.host is None or plan.host.connection == "local" else plan.host.name
-    for planned in plan.machines:
-        name = here if planned.machine.connection == "local" else planned.name
-        found[name] = (True, name == host)
-    found.setdefault(host, (False, True))
+    with_agents = [*(planned.machine for planned in plan.machines), *plan.spare]
+    host = _Place.of(plan.host)
+    names: dict[_Place, str] = {}
+    for machine in (*with_agents, plan.host):
+        place = _Place.of(machine)
+        names.setdefault(place, HERE_NAME if machine is None or place == HERE else machine.name)
+    are_used = {_Place.of(machine) for machine in with_agents}
     return [
         ComputerFacts(
             name=name,
-            processors=processors_here() if name == here else BOARD_PROCESSORS,
-            has_agents=has_agents,
-            is_host=is_host,
+            processors=processors_here() if place == HERE else BOARD_PROCESSORS,
+            has_agents=place in are_used,
+            is_host=place == host,
         )
-        for name, (has_agents, is_host) in found.items()
+        for place, name in names.items()
     ]
 
 

@@ -71,6 +71,8 @@ class LaunchPlan:
     """Machines that run at least one agent, in the inventory's order."""
     idle: tuple[str, ...] = ()
     """Names of machines that are left without an agent, although they would take one."""
+    spare: tuple[Machine, ...] = ()
+    """Those of them that would run more agents, were there more: all, unless a rule takes all that are left."""
     host: Machine | None = None
     """The machine of the run's host; None for the operator's own."""
     notes: tuple[str, ...] = ()
@@ -147,7 +149,7 @@ def make_plan(  # noqa: PLR0913 - labels and the place of faults are of the scen
     if dealer.faults:
         raise InputError(faults=dealer.faults)
     _refuse_twins([place.machine for place in dealer.places if place.agents], dealer.host)
-    order = {name: index for index, name in enumerate(names)}
+    order, idle = {name: index for index, name in enumerate(names)}, dealer.idle()
     return LaunchPlan(
         scenario=scenario.name,
         machines=tuple(
@@ -160,7 +162,8 @@ def make_plan(  # noqa: PLR0913 - labels and the place of faults are of the scen
             for place in dealer.places
             if place.agents
         ),
-        idle=dealer.idle(),
+        idle=tuple(machine.name for machine in idle),
+        spare=() if any(rule.takes_the_rest for rule in scenario.placement) else idle,
         host=dealer.host,
         notes=tuple(dealer.notes),
         is_lockstep=scenario.time.is_lockstep,
@@ -223,10 +226,10 @@ class _Dealer:
             per_machine = rule.per_machine if self.has_inventory else None
             self.deal(path, agents, places, per_machine)
 
-    def idle(self) -> tuple[str, ...]:
+    def idle(self) -> tuple[Machine, ...]:
         """Return the machines that are left without an agent, but the host's and those that take none."""
         return tuple(
-            place.machine.name
+            place.machine
             for place in self.places
             if not place.agents
             and place.machine is not self.host

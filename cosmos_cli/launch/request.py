@@ -15,6 +15,7 @@ from cosmos_cli.launch.events import Listening, Progress
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from madns_runtime.config import AgentLaunch, DeviceLaunch, HostLaunch, RunConfig, to_mapping
 from madns_runtime.plugin.registry import is_file
+from madns_runtime.timing.pack_split import packs_on_machine
 
 MANUAL_READY_S = 600.0
 """Time to start an agent by hand."""
@@ -168,6 +169,7 @@ class LaunchRequest:
             session_hex=self.session_hex,
             machine=machine,
             agents=agents,
+            packs_elsewhere=self.packs_elsewhere(machine),
             host_address=place.host_address or listening.address,
             host_port=listening.port,
             directory=place.directory,
@@ -179,6 +181,15 @@ class LaunchRequest:
             devices=devices_at(self.devices.get(machine, ()), self.config, place),
         )
         return to_mapping(launch)
+
+    def packs_elsewhere(self, machine: str) -> tuple[int, int] | None:
+        """Return how many packs tick on the machines before one and behind it; None where all agents are on one, or by themselves."""
+        per_process, names = self.config.agents.per_process, tuple(self.machines)
+        if per_process == 1 or machine not in names or len(names) == 1:
+            return None
+        packs = [len(packs_on_machine(agents, per_process)) for agents in self.machines.values()]
+        place = names.index(machine)
+        return sum(packs[:place]), sum(packs[place + 1 :])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

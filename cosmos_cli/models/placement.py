@@ -35,6 +35,11 @@ class PlacementRule:
     per_machine: Annotated[int, Ge(1)] | None = None
     """Most agents of this rule on one machine."""
 
+    @property
+    def takes_the_rest(self) -> bool:
+        """Whether it takes all agents that are left."""
+        return not self.agents and self.count is None
+
 
 @dataclass(frozen=True, slots=True)
 class RuledAgents:

@@ -22,8 +22,9 @@ from madns_runtime.reactor.watchdog import end_after_hang_up
 from madns_runtime.realtime.agent import AgentRunner
 from madns_runtime.realtime.agent_calls import LoopSeat
 from madns_runtime.realtime.agent_report import AgentOutcome
-from madns_runtime.realtime.packs import Pack, phase_of, split_into_packs
+from madns_runtime.realtime.packs import Pack, phase_of
 from madns_runtime.realtime.process_port import ProcessPort
+from madns_runtime.timing.pack_split import split_into_packs
 
 ABANDON_S = 5
 """Time for an agent that a fault ends with its process to let go of what outlives it."""
@@ -97,9 +98,8 @@ class AgentProcess:
     def _make_runners(self) -> list[AgentRunner]:
         names_here = [seat.name for seat in self._seats]
         self._process = process = ProcessPort(self._launch, self._reactor, len(names_here))
-        for number, names in enumerate(split_into_packs(names_here)):
-            phase_s = phase_of(number, names, self._launch.config.agents)
-            pack = Pack(phase_s, reactor=self._reactor, process=process)
+        for names in split_into_packs(names_here):
+            pack = Pack(phase_of(names, self._launch), reactor=self._reactor, process=process)
             self._packs |= dict.fromkeys(names, pack)
             process.arms.append(pack.arm)
         if len(process.arms) == 1:

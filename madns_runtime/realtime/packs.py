@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from time import monotonic
 from typing import Protocol
 
-from madns_runtime.config import Agents
+from madns_runtime.config import AgentLaunch
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.realtime.process_port import ProcessPort
 from madns_runtime.realtime.wake_lead import WAIT_S_MAX, WakeLead
+from madns_runtime.timing.pack_split import packs_on_machine
 from madns_runtime.timing.rate import stagger
-
-PACK_AGENTS_MAX = 8
 
 
 class PackMember(Protocol):
@@ -136,24 +135,18 @@ class Pack:
             now_s = monotonic()
 
 
-def split_into_packs(names: Sequence[str]) -> list[Sequence[str]]:
-    """Return the agents of a process in as few packs of PACK_AGENTS_MAX at most as hold them, as even as can be."""
-    count = math.ceil(len(names) / PACK_AGENTS_MAX)
-    bounds = [round(number * len(names) / count) for number in range(count + 1)]
-    return [names[start:end] for start, end in zip(bounds, bounds[1:], strict=False)]
-
-
-def phase_of(number: int, pack: Sequence[str], agents: Agents) -> float:
+def phase_of(pack: Sequence[str], launch: AgentLaunch) -> float:
     """
     Return the phase of a pack, s: all packs of the run are spread over the period.
 
     Args:
-        number: Of the pack among those of its process, from 0.
         pack: Its agents.
-        agents: Those of the run.
+        launch: Of their machine.
     """
-    per_process = min(agents.per_process, agents.count)
-    packs = math.ceil(per_process / PACK_AGENTS_MAX)
-    process = agents.resolved_names().index(pack[0]) // per_process
-    processes = math.ceil(agents.count / per_process)
-    return stagger(process * packs + number, processes * packs, agents.tick_hz, phase=agents.phase)
+    agents, elsewhere = launch.config.agents, launch.packs_elsewhere
+    names = agents.resolved_names() if elsewhere is None else launch.agents
+    before, behind = elsewhere or (0, 0)
+    packs = packs_on_machine(names, agents.per_process)
+    number = next(number for number, names in enumerate(packs) if pack[0] in names)
+    count = before + len(packs) + behind
+    return stagger(before + number, count, agents.tick_hz, phase=agents.phase)

@@ -330,3 +330,20 @@ def test_records_on_another_machine_are_synced_unless_the_scenario_says_how() ->
 
     assert config_at(CONFIG, there).recording.sync_interval_s == SYNC_INTERVAL_S
     assert config_at(own, there).recording.sync_interval_s == 0
+
+
+def test_packs_of_a_run_are_numbered_through_all_its_machines():
+    """24 agents on three machines, three per process, which is three packs on each."""
+    agents = Agents(count=24, per_process=3)
+    names = agents.resolved_names()
+    machines = {"pi01": names[::3], "pi02": names[1::3], "pi03": names[2::3]}
+
+    def numbers(config: RunConfig, machines: dict[str, tuple[str, ...]]) -> list[Any]:
+        request = LaunchRequest(config=config, directory=Path("/runs/0007-x"), machines=machines)
+        return [request.packs_elsewhere(name) for name in machines]
+
+    shared = dataclasses.replace(CONFIG, agents=agents)
+    assert numbers(shared, machines) == [(0, 6), (3, 3), (6, 0)]
+    assert numbers(shared, {"pi01": names}) == [None]
+    by_themselves = dataclasses.replace(agents, per_process=1)
+    assert numbers(dataclasses.replace(CONFIG, agents=by_themselves), machines) == [None] * 3

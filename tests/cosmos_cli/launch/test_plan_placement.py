@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.fleet.target import Target, target_of
+from cosmos_cli.launch.capacity_view import computers_of
 from cosmos_cli.launch.plan import make_plan
 from cosmos_cli.models.inventory import Machine, Variables, load_machines
 from cosmos_cli.models.scenario import Scenario
@@ -129,6 +130,33 @@ def test_rule_with_devices_takes_machines_that_have_them_all():
 
 def test_machine_takes_no_more_agents_than_its_inventory_allows():
     assert placed(9) == {"pi01": [1, 2, 3], "pi02": [4, 5, 6], "pi03": [7, 8], "pi04": [9]}
+
+
+def computers(count, *rules, boards=TOWER, host=None):
+    """Return the names of the computers whose capacity is predicted, with `+` where they run agents."""
+    plan = make_plan(scenario(count, placement=rules), boards, host=host)
+    return [each.name + "+" * each.has_agents for each in computers_of(plan)]
+
+
+def test_capacity_is_that_of_all_machines_on_which_more_agents_would_run():
+    assert computers(1) == ["pi01+", "pi02+", "pi03+", "pi04+", "this computer"]
+    assert computers(1, host="pi02") == ["pi01+", "pi03+", "pi04+", "pi02"]
+    rest_is_on_one = {"machines": "pi02"}
+    assert computers(3, rest_is_on_one) == ["pi02+", "this computer"]
+    assert computers(1, {"count": 1, "machines": "pi02"})[1:] == [
+        "pi01+",
+        "pi03+",
+        "pi04+",
+        "this computer",
+    ]
+
+
+def test_machines_of_one_address_are_one_computer_of_the_capacity():
+    one = machines(1) + [
+        Machine(name="twin", address="10.0.0.0", variables=Variables.of({"cosmos_root": "~/twin"}))
+    ]
+
+    assert computers(4, boards=one) == ["pi00+", "this computer"]
 
 
 def test_machine_that_takes_no_agents_is_not_called_idle():
