@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -84,10 +85,11 @@ def floor(
         for each in failed(outcomes)
     ]
     console.table(COLUMNS, rows)
-    exit_code = ExitCode.MACHINES if failed(outcomes) else ExitCode.OK
+    lacking = [each.machine for each in outcomes if each.failure or _not_made([each])]
+    exit_code = ExitCode.MACHINES if lacking else ExitCode.OK
     retry = None
     if fleet:
-        names = [each.machine for each in failed(outcomes)]
+        names = [name for name in lacking if name != HERE]
         retry = offer_retry(console, fleet.sources, failed=names, count=len(fleet.targets))
     console.data(_verdict(outcomes, time.monotonic() - start_s))
     console.print_json(
@@ -110,12 +112,19 @@ def _measure_here(seconds: float, console: Console) -> Outcome[list[Told]]:
     )[0]
 
 
-def _verdict(outcomes: list[Outcome[list[Told]]], duration_s: float) -> str:
+def _verdict(outcomes: Sequence[Outcome[list[Told]]], duration_s: float) -> str:
     bad = len(failed(outcomes))
     refused = sum(
         any(told["refusal"] for told in each.value) for each in outcomes if each.value is not None
     )
     parts = [f"{counted(len(outcomes) - bad, 'machine')} measured"]
     parts += [f"{bad} failed"] if bad else []
+    missing = _not_made(outcomes)
+    parts += [f"{counted(missing, 'measurement')} not made"] if missing else []
     parts += [f"SCHED_FIFO refused on {refused}"] if refused else []
     return f"{', '.join(parts)} in {duration_s:.1f} s"
+
+
+def _not_made(outcomes: Sequence[Outcome[list[Told]]]) -> int:
+    """Return how many measurements failed on machines that answered; one that SCHED_FIFO was refused for did not."""
+    return sum(bool(told["error"]) for each in outcomes for told in each.value or ())

@@ -103,9 +103,11 @@ def doctor(
     told = [finding for machine in findings.values() for finding in machine]
     _show(console, told, outcomes, is_all=all_)
     exit_code = _exit_code(told, outcomes, is_strict=strict)
-    names = [outcome.machine for outcome in failed(outcomes)]
+    names = [outcome.machine for outcome in failed(outcomes) if outcome.machine != HERE]
     retry = None
-    if fleet:
+    if (
+        fleet and scenario is None
+    ):  # of a scenario, those that failed alone would be measured for all of its agents
         retry = offer_retry(console, fleet.sources, failed=names, count=len(fleet.targets))
     console.data(_verdict(told, outcomes, time.monotonic() - start_s))
     console.print_json(
@@ -228,7 +230,9 @@ class _Examination:
             and (trip := outcome.value["round_trips"])
             and trip.get("p50_ms") is not None
         ]
-        latency_s = max(trips_ms) / 2e3 if trips_ms else LATENCY_S_UNKNOWN
+        given_ms = self._scenario_file.scenario.plan.latency_ms
+        unknown_s = LATENCY_S_UNKNOWN if given_ms is None else given_ms / 1e3
+        latency_s = max(trips_ms) / 2e3 if trips_ms else unknown_s
         resources = resources_of(self._scenario_file, latency_s)
         found = feasibility_of(self._scenario_file, resources)
         return None if found is None else found.to_mapping()

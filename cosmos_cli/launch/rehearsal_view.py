@@ -247,7 +247,8 @@ def pace_of(rehearsal: Rehearsal, outcomes: Sequence[Outcome[MachineRehearsal]])
     if trips_ms:
         latency_s, source = max(trips_ms) / 2e3, "measured"
     else:
-        latency_s, source = latency_of(rehearsal.plan)
+        given_ms = rehearsal.scenario.scenario.plan.latency_ms
+        latency_s, source = latency_of(rehearsal.plan, given_ms=given_ms)
     resources = resources_of(rehearsal.scenario, latency_s)
     feasibility, unknown = None, ""
     if not rehearsal.plan.is_lockstep:

@@ -139,6 +139,11 @@ class AgentPort:
         """Take simulated time to be *t_s*, s, until the clock is set; 0 where it has not begun."""
         self._rejoined_at_s = monotonic() - t_s if t_s > 0.0 else None
 
+    @property
+    def has_rejoined(self) -> bool:
+        """Whether the agent was set up while simulated time ran already."""
+        return self._rejoined_at_s is not None
+
     def at(self, local_s: float) -> float:
         """Return the simulated time when this machine's monotonic clock shows *local_s*, s; it must have begun."""
         return self.session.clock.to_host_s(local_s) - self.t0_host_s  # type: ignore[operator]  # each tick

@@ -93,8 +93,8 @@ class PacedTicks:
         """Simulated time minus the local clock, as the newest tick began, s."""
 
     def begin(self, now_s: float) -> None:
-        """Take note that the agent runs from simulated time *now_s* on, s: ticks that are over were never its own."""
-        if now_s > 0:
+        """Take note that the agent runs from simulated time *now_s* on, s: what was over when it rejoined was never its own."""
+        if now_s > 0 and self._port.has_rejoined:
             self.pacer.skip_to(now_s)
         self.late.started_s = local_s = monotonic()
         self._ahead_s = now_s - local_s

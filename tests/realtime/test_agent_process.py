@@ -89,7 +89,7 @@ def test_every_pack_of_a_process_is_timed_anew_with_the_clock_that_they_share(mo
     config = SimpleNamespace(agents=Agents(count=9, tick_hz=10.0, per_process=9))
     process = AgentProcess.__new__(AgentProcess)
     process._reactor = SimpleNamespace(call_at=lambda due_s, call: None, end_if_forked=lambda: None)
-    process._launch = SimpleNamespace(config=config)
+    process._launch = SimpleNamespace(config=config, packs_elsewhere=None)
     process._seats = [SimpleNamespace(name=name) for name in config.agents.resolved_names()]
     process._program = RoleProgram(make=object, parameters=None)
     process._packs, process._incarnations, process._counted = {}, {}, {}

@@ -69,6 +69,7 @@ class Loop:
             must_flush=False,
             at=lambda local_s: local_s,
             local_s=lambda t_s: t_s,
+            has_rejoined=False,
         )
         calls = TickCalls(
             prepare=None,
@@ -237,6 +238,27 @@ def test_ticks_at_the_end_that_no_other_followed_are_recorded_with_their_cause(m
     assert agent.pacer.is_over
     assert rows(loop.records[0], "late_ticks") == [(last + 1, 0, 6, "step")]
     assert agent.late.counts() == {"step": 6}
+
+
+@pytest.mark.parametrize(("has_rejoined", "missed", "not_run"), [(False, 5, 0), (True, 0, 6)])
+def test_first_ticks_that_an_order_to_start_came_too_late_for_are_missed_by_it(
+    monkeypatch, has_rejoined, missed, not_run
+):
+    """Not so those of an agent that was not there: they were never its own."""
+    loop = Loop(monkeypatch, 0)
+    agent = loop.agents[0]
+    agent._step = lambda tick: None
+    agent._port.has_rejoined = has_rejoined
+    loop.clock.now_s = agent.pacer.deadline_of(5) + 1e-3
+    agent.begin(loop.clock.now_s)
+    if has_rejoined:
+        loop.clock.now_s = agent.next_deadline_s()
+    loop.account.begin_ticks(loop.clock.now_s)
+    agent.tick()
+
+    summary = agent.pacer.summary()
+    assert (summary["missed"], summary["not_run"]) == (missed, not_run)
+    assert agent.late.counts() == ({"start": missed} if missed else {})
 
 
 @pytest.mark.parametrize(("leap_s", "missed"), [(0.055, 5), (-0.055, 0), (100.0, 290)])

@@ -11,6 +11,7 @@ from harness.waiting import wait_until
 
 from cosmos_cli.app import run as cosmos
 from cosmos_cli.bench import floor
+from cosmos_cli.commands import bench_floor
 from cosmos_cli.doctor.probe import Responder
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
@@ -122,6 +123,22 @@ def test_floor_leaves_out_the_network_of_a_machine_whose_way_here_is_not_known(m
     rows = list(floor.rows_of("pi01", told))
     assert len(rows) == 6
     assert "through a ProxyCommand" in rows[-1][4]
+
+
+def test_measurement_that_could_not_be_made_is_counted_and_ends_with_3(monkeypatch, capsys):
+    made = {"refusal": None, "is_preempt_rt": False, "lateness_us": None, "round_trip_us": None}
+    made |= {"way": "loopback", "rate_hz": 100.0, "missed": 0, "sent": 0, "answered": 0}
+    told = [
+        {**made, "policy": "normal", "error": "not done in 5 s"},
+        {**made, "policy": "fifo", "error": None, "refusal": "Operation not permitted"},
+    ]
+    monkeypatch.setattr(bench_floor, "measure_floor", lambda *_, **more: told)
+
+    code = cosmos(["bench", "floor", "--seconds", "0.5"])
+
+    assert code == 3
+    out = capsys.readouterr().out
+    assert "1 machine measured, 1 measurement not made, SCHED_FIFO refused on 1 in" in out
 
 
 OF_A_MOMENT = ("vars.trip_ms_max=60000", "vars.sd_ms_max=60000", "vars.trips_hz_min=0")

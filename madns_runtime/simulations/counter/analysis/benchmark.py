@@ -66,19 +66,24 @@ def _rows(seen_by: str, by_agent: dict[str, Distribution]) -> list[dict[str, Any
 
 def _counts(run: RecordedRun) -> dict[str, dict[str, Any]]:
     """Return what each agent sent, got back and lost, its ticks and those that it missed."""
-    ticks = run.tables.get("ticks")
+    tables = [run.tables.get("ticks"), run.tables.get("late_ticks")]
+    ticks, late = [None if table is None or not table.has("missed") else table for table in tables]
     found: dict[str, dict[str, Any]] = {}
     for agent in mapping_at(run.document, "simulation", "agents"):
         own = run.agent_summary(agent)
         found[agent] = {key: own.get(key) for key in ("sent", "returned", "lost")}
         if ticks is not None and agent in ticks.sources:
-            found[agent] |= _tick_counts(ticks, agent)
+            done, missed = _count(ticks, agent)
+            # Those that no tick followed are told by the records of causes alone.
+            told = 0 if late is None or agent not in late.sources else _count(late, agent)[1]
+            found[agent] |= {"ticks": done, "missed": max(missed, told)}
     return found
 
 
-def _tick_counts(ticks: RecordedTable, agent: str) -> dict[str, int]:
-    done = missed = 0
-    for columns in ticks.batches(agent, ("missed",), ROWS_MAX):
-        done += len(columns["missed"])
+def _count(table: RecordedTable, agent: str) -> tuple[int, int]:
+    """Return an agent's records, and the missed ticks that they tell of."""
+    records = missed = 0
+    for columns in table.batches(agent, ("missed",), ROWS_MAX):
+        records += len(columns["missed"])
         missed += int(np.nansum(columns["missed"]))
-    return {"ticks": done, "missed": missed}
+    return records, missed

@@ -1,0 +1,33 @@
+"""The numbers of the thesis's benchmark from records: missed ticks among them that no tick followed."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from madns_runtime.analysis.tables import RecordedRun
+from madns_runtime.simulations.counter.analysis.benchmark import document
+
+
+def table(**missed):
+    """Stand for a table of one column per agent."""
+    return SimpleNamespace(
+        sources=tuple(missed),
+        has=lambda *names: set(names) <= {"missed"},
+        batches=lambda agent, names, rows_max: iter([{"missed": np.array(missed[agent])}]),
+    )
+
+
+@pytest.mark.parametrize(
+    ("late", "missed"), [({}, 3), ({"a": [1, 2]}, 3), ({"a": [1, 2, 5], "b": [9]}, 8)]
+)
+def test_missed_ticks_that_no_tick_followed_count(late, missed):
+    run = RecordedRun(
+        document={"simulation": {"agents": {"a": {"sent": 7, "returned": 6, "lost": 1}}}},
+        tables={"ticks": table(a=[0, 1, 0, 2]), "late_ticks": table(**late)},
+        config=None,
+    )
+
+    assert document(run)["benchmark"]["agents"] == {
+        "a": {"sent": 7, "returned": 6, "lost": 1, "ticks": 4, "missed": missed}
+    }
