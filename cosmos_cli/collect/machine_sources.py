@@ -44,6 +44,8 @@ class RecordingMachines:
 
     remote: tuple[RecordingMachine, ...] = ()
     machine_of_agent: Mapping[str, str] = field(default_factory=dict)
+    machine_of_device: Mapping[str, str] = field(default_factory=dict)
+    """By full names, such as pi22/imu."""
     host_machine: str | None = None
     """Machine of the run's host; None when it was this computer."""
 
@@ -62,6 +64,11 @@ class RecordingMachines:
             machine_of_agent={
                 str(agent): name for name in machines for agent in _listed(machines[name])
             },
+            machine_of_device={
+                str(device): name
+                for name, devices in _lists(plan.get("devices"))
+                for device in devices
+            },
             host_machine=host.machine if host else None,
         )
 
@@ -79,8 +86,9 @@ class RecordingMachines:
             return rest[0]
         if len(rest) > 1 and top == AGENTS:
             return self.machine_of_agent.get(rest[0])
-        if len(rest) > 1 and top == DEVICES:  # of an agent, or of a machine
-            return self.machine_of_agent.get(rest[0], rest[0])
+        if len(rest) > 1 and top == DEVICES:  # of an agent, or of a machine, which may be called alike
+            agents = self.machine_of_agent.get(rest[0], rest[0])
+            return self.machine_of_device.get("/".join(rest[:2]), agents)
         return None
 
 
@@ -108,3 +116,8 @@ def _mappings(value: object) -> dict[str, Mapping[str, Any]]:
 def _listed(entry: Mapping[str, Any]) -> list[Any]:
     agents = entry.get("agents")
     return agents if isinstance(agents, list) else []
+
+
+def _lists(value: object) -> list[tuple[str, list[Any]]]:
+    items = value.items() if isinstance(value, Mapping) else ()
+    return [(str(name), each) for name, each in items if isinstance(each, list)]

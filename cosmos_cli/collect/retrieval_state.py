@@ -181,7 +181,8 @@ def forget(run: RunDirectory, names: Sequence[str]) -> list[str]:
     notes = {name: read_note(run, name) for name in sources}
     open_ = [name for name, note in notes.items() if note is None or note.state == "verified"]
     wanted = open_ if EVERY in names else list(dict.fromkeys(names))
-    unknown = [name for name in wanted if name not in sources]
+    forgotten = {name for name, note in notes.items() if note and note.state == "forgotten"}
+    unknown = [name for name in wanted if name not in open_ and name not in forgotten]
     if unknown or not open_:
         known = ", ".join(open_) or "none; there is nothing to forget"
         raise InputError(

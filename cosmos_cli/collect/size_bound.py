@@ -48,9 +48,17 @@ def recordable_bytes(config: RunConfig | None, agents: int, *, is_host: bool) ->
     return BASE_BYTES + ticks * recorders * TICK_BYTES
 
 
-def check_sizes(files: Sequence[SizedFile], bytes_max: int, directory: str) -> None:
+def check_sizes(
+    files: Sequence[SizedFile], bytes_max: int, directory: str, *, run: str
+) -> None:
     """
     See that a machine has no more of a run than it can have recorded.
+
+    Args:
+        files: Those that it has.
+        bytes_max: What it can have recorded.
+        directory: Where they are there.
+        run: What `cosmos collect` is told, for a shell.
 
     Raises:
         MachineFailure: It has.
@@ -64,7 +72,7 @@ def check_sizes(files: Sequence[SizedFile], bytes_max: int, directory: str) -> N
         f"{directory} holds {size_words(total)}, of which {largest.path} is"
         f" {size_words(largest.size_bytes)}; by its plan the run can have recorded at most"
         f" {size_words(bytes_max)} there",
-        "look at it there; if it is right, repeat with: cosmos collect --size-max SIZE",
+        f"look at it there; if it is right, repeat with: cosmos collect --size-max SIZE {run}",
     )
 
 

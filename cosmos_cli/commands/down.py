@@ -23,7 +23,7 @@ from cosmos_cli.commands.fleet_command import (
     failure_teller,
     where_words,
 )
-from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.errors import ExitCode, InputError, MachinesError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.fleet.connection import ConnectOptions
@@ -62,6 +62,16 @@ class Doomed:
     host: str | None = None
     """The machine of its host; None for this computer."""
 
+    def is_on(self, targets: Sequence[Target]) -> bool:
+        """Tell whether a part of it is on one of these machines."""
+        is_here = self.here is not None and any(each.connection == "local" for each in targets)
+        return is_here or any(each.name in self.there for each in targets)
+
+    def is_called(self, which: str) -> bool:
+        """Tell whether *which* is its name, its number or a directory of it, here or on a machine."""
+        there = {source.directory for source in self.there.values()}
+        return which in {self.directory, *there} or is_called(self.run, self.directory, which)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
@@ -82,7 +92,12 @@ def down(
         list[str] | None,
         typer.Argument(metavar="RUN...", help="Names, numbers or directories of runs."),
     ] = None,
-    all_: Annotated[bool, typer.Option("--all", help="End every living run.")] = False,
+    all_: Annotated[
+        bool,
+        typer.Option(
+            "--all", help="End every living run; with --limit, those with a part on these machines."
+        ),
+    ] = False,
     inventory: SomeInventoryOption = None,
     limit: LimitOption = None,
     timeout_s: Annotated[
@@ -107,7 +122,8 @@ def down(
     not answer, with 1 when something lives still.
     """
     console = Console(json=json, quiet=quiet, instead="the exit code tells what lives still")
-    targets = [t for t in targets_of(inventory, limit) if t.connection != "local"]
+    listed = targets_of(inventory, limit)
+    targets = [t for t in listed if t.connection != "local"]
     fleet = Fleetwide(
         options=ConnectOptions(accept_new_host_keys=accept_new_host_keys, listed=by_name(targets)),
         forks=forks,
@@ -117,6 +133,8 @@ def down(
     known = known_runs(living_runs(), unfinished_runs())
     known += found_runs(known, targets, outcomes)
     unasked = [outcome.machine for outcome in failed(outcomes)]
+    if all_ and limit is not None:
+        known = [run for run in known if run.is_on(listed)]
     chosen = choose(known, runs or [], is_all=all_, unasked=unasked)
     ended = [_end(run, fleet, timeout_s, console.say) for run in chosen]
     bad = [each for one in ended for each in failed(one.there)] + failed(outcomes)
@@ -131,7 +149,9 @@ def down(
     ask_whether_moved(console, failures, inventory, shlex.join(["down", *named]))
     is_left = any(one.is_left for one in ended)
     exit_code = ExitCode.RUN_FAILED if is_left else ExitCode.MACHINES if bad else ExitCode.OK
-    retry = offer_retry_of(console, inventory, targets, [outcome.machine for outcome in bad])
+    # Runs that begin meanwhile are not to end by a repetition.
+    again = [] if all_ else [outcome.machine for outcome in bad]
+    retry = offer_retry_of(console, inventory, targets, again)
     console.print_json(
         {
             "runs": [_mapping(one) for one in ended],
@@ -190,6 +210,7 @@ def choose(
 
     Raises:
         InputError: Nothing or something unknown was named, or a name that fits several.
+        MachinesError: A run was named that none but the *unasked* machines may have.
     """
     if is_all and wanted:
         raise InputError(
@@ -203,10 +224,11 @@ def choose(
         raise InputError(f"name the runs to end, or give --all; living runs: {names}")
     chosen: list[Doomed] = []
     for which in wanted:
-        found = [run for run in known if is_called(run.run, run.directory, which)]
+        found = [run for run in known if run.is_called(which)]
         found = found or _otherwise_called(which, known)
         if not found:
-            raise InputError(f"{which}: no such run lives on this machine; living runs: {names}")
+            unknown = MachinesError if unasked else InputError
+            raise unknown(f"{which}: no such run lives on this machine; living runs: {names}")
         if len(found) > 1:
             directories = ", ".join(run.directory for run in found)
             raise InputError(f"{which}: several living runs; give the directory: {directories}")

@@ -162,10 +162,11 @@ def test_bound_grows_with_what_the_plan_lets_a_machine_record():
 def test_sizes_up_to_the_bound_pass():
     files = [SizedFile("a", 60), SizedFile("b", 40)]
 
-    check_sizes(files, 100, "/d")
-    check_sizes([], 0, "/d")
-    with pytest.raises(MachineFailure, match="of which a is 60 B"):
-        check_sizes(files, 99, "/d")
+    check_sizes(files, 100, "/d", run="runs/7")
+    check_sizes([], 0, "/d", run="runs/7")
+    with pytest.raises(MachineFailure, match="of which a is 60 B") as caught:
+        check_sizes(files, 99, "/d", run="runs/7")
+    assert caught.value.advice.endswith("cosmos collect --size-max SIZE runs/7")
 
 
 def test_hashing_has_a_deadline_by_size():
