@@ -182,9 +182,7 @@ class MachineRetrieval:
         if sizes is None:
             return self._gone()
         # Before a byte is read there: a file may say to be larger than any disk.
-        check_sizes(
-            sizes, self._bytes_max, self._source.directory, run=self._run.shell_path
-        )
+        check_sizes(sizes, self._bytes_max, self._source.directory, run=self._run.shell_path)
         self._incoming.check_room_for(sizes)
         listed = self._list(helper, sizes)
         if listed is None:

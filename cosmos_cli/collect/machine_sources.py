@@ -86,7 +86,9 @@ class RecordingMachines:
             return rest[0]
         if len(rest) > 1 and top == AGENTS:
             return self.machine_of_agent.get(rest[0])
-        if len(rest) > 1 and top == DEVICES:  # of an agent, or of a machine, which may be called alike
+        if (
+            len(rest) > 1 and top == DEVICES
+        ):  # of an agent, or of a machine, which may be called alike
             agents = self.machine_of_agent.get(rest[0], rest[0])
             return self.machine_of_device.get("/".join(rest[:2]), agents)
         return None

@@ -48,9 +48,7 @@ def recordable_bytes(config: RunConfig | None, agents: int, *, is_host: bool) ->
     return BASE_BYTES + ticks * recorders * TICK_BYTES
 
 
-def check_sizes(
-    files: Sequence[SizedFile], bytes_max: int, directory: str, *, run: str
-) -> None:
+def check_sizes(files: Sequence[SizedFile], bytes_max: int, directory: str, *, run: str) -> None:
     """
     See that a machine has no more of a run than it can have recorded.
 

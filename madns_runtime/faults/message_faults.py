@@ -27,6 +27,7 @@ from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import Service, Transmission
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
 from madns_runtime.timeline.fault_kinds import PARTITION
+from madns_runtime.written_times import later_s
 
 
 class MessageSender(Protocol):
@@ -181,7 +182,7 @@ class MessageFaults:
             counts["double_discarded"] += 1  # the other classes promise exactly once
             fate.is_doubled = False
         if fate.is_held or fate.late_s or must_wait:
-            due_s = math.inf if fate.is_held else now_s + fate.late_s
+            due_s = math.inf if fate.is_held else later_s(now_s, fate.late_s)
             is_kept = self._late.put(message._replace(copies=1 + fate.is_doubled), due_s)
             counts["late" if is_kept else "lost"] += 1
             counts["no_room"] += not is_kept
@@ -229,7 +230,7 @@ class MessageFaults:
                 continue
             self._between["late" if fate.late_s else "passed"] += 1
             self._between["doubled"] += fate.is_doubled
-            arrives_s = outcome.arrives_s + fate.late_s
+            arrives_s = later_s(outcome.arrives_s, fate.late_s)
             late = outcome if not fate.late_s else dataclasses.replace(outcome, arrives_s=arrives_s)
             found += [late] * (1 + fate.is_doubled)
         return found

@@ -17,6 +17,7 @@ import numpy as np
 
 from madns_runtime.hardware.contract import Device, Sample, Value
 from madns_runtime.hardware.fault_actions import check_fault
+from madns_runtime.written_times import later_s
 
 HELD_MAX: Final = 10_000
 """Delayed samples that may wait; the oldest is given up beyond, and counted."""
@@ -95,7 +96,7 @@ class InsertedFaults:
         """Return the delayed samples whose time has come by *now_s*."""
         delay_s = self._values.get("delay", 0.0)
         found = []
-        while self._held and self._held[0].taken_s + delay_s <= now_s:
+        while self._held and later_s(self._held[0].taken_s, delay_s) <= now_s:
             found.append(self._held.popleft())
         return found
 
@@ -109,7 +110,7 @@ class InsertedFaults:
         """Return when the next delayed sample is due; infinity if none waits."""
         if not self._held:
             return math.inf
-        return self._held[0].taken_s + self._values.get("delay", 0.0)
+        return later_s(self._held[0].taken_s, self._values.get("delay", 0.0))
 
     def _alters(self, action: str) -> bool:
         """Tell whether samples are altered by an action: it is in force, and nobody else carries it out."""

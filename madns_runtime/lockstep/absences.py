@@ -11,6 +11,7 @@ from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.messages import AgentFault
+from madns_runtime.timing.rate import count_ticks
 
 RESTART_DELAY_S: Final = 0.2
 """Simulated time from the loss of an agent that agents.restarts_max gives another start to its return."""
@@ -38,7 +39,8 @@ class Absences:
         config = core.config
         self._restarts_max = config.agents.restarts_max
         self._tick_hz = config.agents.tick_hz
-        self._duration_s = config.time.duration_s
+        ticks = count_ticks(config.time.duration_s, config.agents.tick_hz)
+        self._last_tick_s = (ticks - 1) / config.agents.tick_hz
         self._goes_on = config.on_agent_loss == "continue"
         self._account = core.account
         self._pool = core.pool
@@ -98,13 +100,17 @@ class Absences:
     def _end_without_agents(self) -> None:
         """End a run of which no agent is left, nor returns before it is over."""
         agents = self._account.agents
-        is_waiting = any(due_s < self._duration_s for due_s, _ in self._returns)
+        is_waiting = any(self.has_tick_from(due_s) for due_s, _ in self._returns)
         if all(agent.is_lost for agent in agents) and (self._pool.have_all_ended or not is_waiting):
             names = self._account.names
             reasons = dict.fromkeys(agent.reason or "" for agent in agents)
             self._barrier.fail(", ".join(names), "; ".join(reasons))
 
     # Returns --------------------------------------------------------------------------------------
+
+    def has_tick_from(self, t_s: float) -> bool:
+        """Tell whether a tick is left for an agent that returns at simulated time *t_s*, s."""
+        return t_s <= self._last_tick_s + TIME_EPSILON_S
 
     def bring_back(self, number: int, settle: Callable[[], None]) -> None:
         """

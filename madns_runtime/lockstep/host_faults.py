@@ -11,6 +11,7 @@ from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.protocol.messages import AgentFault
 from madns_runtime.timeline import fault_kinds as kinds
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
+from madns_runtime.written_times import later_s
 
 
 class LockstepFaults:
@@ -24,7 +25,6 @@ class LockstepFaults:
 
     def __init__(self, core: LockstepCore, absences: Absences) -> None:
         self._goes_on = core.config.on_agent_loss == "continue"
-        self._duration_s = core.config.time.duration_s
         self._account = core.account
         self._absences = absences
         self._half = core.half
@@ -96,11 +96,12 @@ class LockstepFaults:
     def _kill(self, action: TimelineAction, agents: list[str]) -> None:
         after_s = RESTART_DELAY_S if action.word == kinds.RESTART else action.for_s
         why = kinds.killed_words(action)
-        returns_s = None if after_s is None else max(action.t_s, self._clock.t_s) + after_s
+        begun_s = max(action.t_s, self._clock.t_s)
+        returns_s = None if after_s is None else later_s(begun_s, after_s)
         for agent in agents:
             self._account.intended.order(agent, why, returns_s=returns_s)
         # As in real time: what is ordered is told, and one for which no tick would be left stays away.
-        will_return = returns_s is not None and returns_s < self._duration_s
+        will_return = returns_s is not None and self._absences.has_tick_from(returns_s)
         ordered_s = 0.0 if action.word == kinds.RESTART else action.for_s
         value = ordered_s if will_return and ordered_s is not None else math.nan
         fault = AgentFault(action.number, kinds.KILL, True, value, why)

@@ -4,6 +4,7 @@ import itertools
 import math
 import random
 from collections import defaultdict
+from types import SimpleNamespace
 
 import pytest
 
@@ -180,6 +181,32 @@ def test_delayed_messages_come_in_order_where_their_class_promises_it():
     assert reliable == list(range(20))
     assert sorted(best) == list(range(20)) != best
     assert rig.counts()["late"] == rig.counts()["released"] == 40
+
+
+@pytest.mark.parametrize(("delay_s", "ticks"), [(0.1, 1), (0.3, 3), (0.4, 4), (0.7, 7)])
+def test_delayed_messages_come_at_the_tick_at_which_their_time_has_come(delay_s, ticks):
+    """0.1 + 0.2 is more than 0.3 in binary numbers: they would wait for the tick after."""
+    rig = Rig()
+    rig.faults.begin(action("delay_messages", delay_s=delay_s, jitter_s=0.0))
+    came = {}
+    for tick in range(60):
+        rig.now_s = tick / 10
+        rig.faults.release()
+        came |= {sent: tick for _, sent in rig.received if sent not in came}
+        rig.faults.take("a", tick, BEST)
+
+    assert came == {tick: tick + ticks for tick in range(60 - ticks)}
+
+
+def test_delayed_messages_between_agents_arrive_at_the_sum_of_both_times():
+    rig = Rig()
+    rig.faults.begin(action("delay_messages", delay_s=0.2, jitter_s=0.0))
+    outcome = LinkOutcome(to="b", outcome=DELIVERED, arrives_s=0.1)
+    transmission = SimpleNamespace(number=1)
+
+    (late,) = rig.faults.ways("a", transmission, [outcome])
+
+    assert late.arrives_s == 0.3
 
 
 def test_a_message_behind_a_late_one_waits_also_when_the_fault_is_over():

@@ -84,6 +84,16 @@ def test_delay_holds_samples_until_their_time_in_order():
     assert faults.next_due_s() == math.inf
 
 
+def test_delay_holds_samples_until_the_sum_of_both_times_as_they_are_written():
+    """0.1 + 0.2 is more than 0.3 in binary numbers: in lockstep they would wait for the tick after."""
+    faults = InsertedFaults(1)
+    faults.insert("delay", 0.2)
+    faults.apply(sample(1.0, 0.1))
+
+    assert faults.next_due_s() == 0.3
+    assert [each.taken_s for each in faults.due(0.3)] == [0.1]
+
+
 def test_disconnect_lasts_until_clear():
     faults = InsertedFaults(1)
     faults.insert("disconnect")

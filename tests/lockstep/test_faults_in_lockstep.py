@@ -180,10 +180,19 @@ def test_an_agent_that_is_killed_returns_when_it_is_said_and_is_not_judged(run_f
 
 
 @pytest.mark.parametrize(
-    ("action", "for_s", "told_s"), [("kill", None, None), ("kill", 0.9, None), ("restart", None, 0)]
+    ("action", "at_s", "for_s", "told_s"),
+    [
+        ("kill", 0.3, None, None),
+        ("kill", 0.3, 0.9, None),
+        ("kill", 0.7, 0.2, 0.2),  # at the last tick, 0.9 s
+        ("kill", 0.7, 0.25, None),  # behind it, before the run's end
+        ("restart", 0.3, None, 0),
+    ],
 )
-def test_an_agent_records_when_it_is_to_return_as_in_real_time(run_faults, action, for_s, told_s):
-    run = run_faults(entry(action, for_s=for_s))
+def test_an_agent_records_when_it_is_to_return_as_in_real_time(
+    run_faults, action, at_s, for_s, told_s
+):
+    run = run_faults(entry(action, at_s=at_s, for_s=for_s))
     run.result()
 
     assert returns_after_s(run) == told_s

@@ -16,7 +16,7 @@ Flags = NDArray[np.bool_]
 Places = NDArray[np.int64]
 P99 = 0.99
 TIMES_KEPT = 4096
-"""Times within bounds, the earliest: of more than so many that come late, settled may be too late."""
+"""Times within bounds, the earliest, that settled keeps; it looks again where it should have kept others."""
 OCCURRENCES_KEPT = 100_000
 """Times of an event that are kept, the first ones; the others are counted."""
 
@@ -268,6 +268,8 @@ class Settled(Accumulator):
         self._t_s: Floats = np.empty(0)
         """Times behind it, in order, and their places."""
         self._places: Places = np.empty(0, np.int64)
+        self._left_out_s = (math.inf, -math.inf)
+        """Earliest and latest of those within bounds that were not kept."""
 
     def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         within = holds(self._when, values)
@@ -277,14 +279,33 @@ class Settled(Accumulator):
             found = float(last_s), int(their[outside_s == last_s].max())
             self._outside = max(self._outside, found)
         elif len(self._t_s) == TIMES_KEPT and t_s.min() > self._t_s[-1]:
-            return  # behind all that are kept, as most of a long run are
+            self._leave_out(t_s)  # behind all that are kept, as most of a long run are
+            return
         all_s = np.concatenate((self._t_s, t_s[within]))
         their = np.concatenate((self._places, places[within]))
         last_s, last_place = self._outside
         behind = (all_s > last_s) | ((all_s == last_s) & (their > last_place))
         all_s, their = all_s[behind], their[behind]
-        order = np.lexsort((their, all_s))[:TIMES_KEPT]
+        order = np.lexsort((their, all_s))
+        self._leave_out(all_s[order[TIMES_KEPT:]])
+        order = order[:TIMES_KEPT]
         self._t_s, self._places = all_s[order], their[order]
+
+    def _leave_out(self, t_s: Floats) -> None:
+        if len(t_s):
+            first_s, last_s = self._left_out_s
+            self._left_out_s = min(first_s, float(t_s.min())), max(last_s, float(t_s.max()))
+
+    @property
+    def must_look_again(self) -> bool:
+        """Whether the first one may be among those left out: a late one outside has come behind those kept."""
+        first_s, last_s = self._left_out_s
+        return last_s >= self._outside[0] and not (len(self._t_s) and self._t_s[0] <= first_s)
+
+    def look_again(self) -> None:
+        """Begin anew with what is known of those outside: all records come once more."""
+        self._t_s, self._places = np.empty(0), np.empty(0, np.int64)
+        self._left_out_s = (math.inf, -math.inf)
 
     def _found_now(self) -> Found:
         since_s = float(self._t_s[0]) if len(self._t_s) else None
@@ -298,18 +319,21 @@ class Occurrences(Accumulator):
         self._word = word
         self.count = 0
         self.found: list[tuple[float, int]] = []
+        self._left_out_s = math.inf
+        """Earliest of those that were not kept."""
 
     def _take(self, t_s: Floats, values: NDArray[Any], places: Places) -> None:
         found = np.flatnonzero(_are(values, self._word))
         self.count += len(found)
-        kept = found[: OCCURRENCES_KEPT - len(self.found)]
+        kept, left_out = np.split(found, [OCCURRENCES_KEPT - len(self.found)])
+        self._left_out_s = min([self._left_out_s, *t_s[left_out].tolist()])
         self.found += zip(t_s[kept].tolist(), places[kept].tolist(), strict=True)
 
     def is_open_at(self, latest_s: float | None) -> bool:
         """Tell whether some of the event that were not kept may be of times up to *latest_s*, None for any."""
         if self.count <= len(self.found):
             return False
-        return latest_s is None or self.found[-1][0] <= latest_s
+        return latest_s is None or self._left_out_s <= latest_s
 
     def _found_now(self) -> Found:
         first_s = min((t_s for t_s, _ in self.found), default=None)

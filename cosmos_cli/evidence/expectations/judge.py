@@ -111,6 +111,9 @@ def judge_expectations(
         for batch in source.batches(stream, [name for name in fields if name]):
             _give(batch, own)
             strangers.take(stream, batch)
+        for each in filter(_Followed.begins_again, own):
+            for batch in source.batches(stream, [each.expectation.field]):
+                _give(batch, [each])
     earlier: dict[str, _Earlier] = {}
     results = []
     for each in followed:
@@ -227,6 +230,15 @@ class _Followed:
         if accumulator is None:
             accumulator = self._accumulators[batch.agent] = self._accumulator()
         accumulator.take(batch.t_s, batch.values, batch.places)
+
+    def begins_again(self) -> bool:
+        """Begin anew and return True where all records must come once more, for a time that was not kept."""
+        settled = [each for each in self._accumulators.values() if isinstance(each, Settled)]
+        if not any(each.must_look_again for each in settled):
+            return False
+        for each in settled:
+            each.look_again()
+        return True
 
     def _accumulator(self) -> Accumulator:  # noqa: PLR0911 - a table of what each statistic is
         expectation = self.expectation

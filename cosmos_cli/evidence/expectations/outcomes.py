@@ -62,7 +62,7 @@ def outcome_of_event(
         if expectation.within_s is not None:
             end_s = later_s(begin_s, expectation.within_s)
             latest_s = end_s if latest_s is None else min(latest_s, end_s)
-    later = [each for each in found.found if each[0] >= begin_s and each[1] > behind]
+    later = [each for each in found.found if each > (begin_s, behind)]
     wrong = [t_s for t_s, _ in later if latest_s is None or t_s <= latest_s]
     if not wrong and found.is_open_at(latest_s):
         why = f"it occurs {found.count} times, and the first {len(found.found)} are looked at"

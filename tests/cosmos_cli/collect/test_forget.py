@@ -115,6 +115,21 @@ def test_name_that_is_no_machines_is_refused_and_nothing_is_noted(split, capsys,
     assert not list(split.run.path.glob("machines/*/retrieved.json"))
 
 
+def test_machine_whose_records_have_come_cannot_be_forgotten(split, monkeypatch, capsys):
+    def connect(target, _):
+        if target.name == "pi01":
+            return LocalConnection(target)
+        raise MachineFailure(FailureKind.UNREACHABLE, "no route")
+
+    monkeypatch.setattr(retrieve, "_connect", connect)
+    assert app.run(["collect", "1"]) == 5
+    capsys.readouterr()
+
+    assert app.run(["collect", "1", "--forget", "pi01"]) == 2
+
+    assert "may still come: pi02" in capsys.readouterr().err
+
+
 def test_run_without_other_machines_has_nothing_to_forget(split, monkeypatch, capsys):
     monkeypatch.setattr(retrieve, "_connect", lambda target, _: LocalConnection(target))
     app.run(["collect", "1"])

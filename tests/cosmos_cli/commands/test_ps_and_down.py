@@ -17,7 +17,10 @@ from harness.ports import free_port
 from harness.waiting import is_alive, wait_until
 
 from cosmos_cli.app import run as cosmos
+from cosmos_cli.collect.machine_sources import RecordingMachine
+from cosmos_cli.commands.down import Doomed, choose
 from cosmos_cli.commands.ps import age_words
+from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_index import remember_run
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.outcome import Outcome
@@ -462,6 +465,63 @@ def test_down_json_names_the_machine_that_could_not_be_asked_and_why(
     told = json.loads(capsys.readouterr().out)
     assert (code, told["exit_code"], told["runs"]) == (3, 3, [])
     assert [machine["failure"]["kind"] for machine in told["machines"]] == ["refused"]
+
+
+def test_down_all_on_some_machines_leaves_runs_alone_that_have_no_part_there(
+    start: Start, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    host = start("0001-a", "host", "host")
+
+    def look(self: object, targets: Sequence[Target]) -> list[Outcome[list[Seen]]]:
+        failure = MachineFailure(FailureKind.UNREACHABLE, "no route")
+        return [Outcome(machine=target.name, failure=failure) for target in targets]
+
+    monkeypatch.setattr(Fleetwide, "look", look)
+
+    code = cosmos(["down", "--all", "-i", "pi01,pi02", "--limit", "pi02", "--json"])
+
+    told = json.loads(capsys.readouterr().out)
+    assert (code, told["runs"]) == (3, [])
+    assert told["retry"] is None  # it would end what began since, too
+    assert is_alive(host.pid)
+
+
+def test_down_of_a_run_that_an_unreachable_machine_may_have_ends_with_3(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def look(self: object, targets: Sequence[Target]) -> list[Outcome[list[Seen]]]:
+        failure = MachineFailure(FailureKind.UNREACHABLE, "no route")
+        return [Outcome(machine=target.name, failure=failure) for target in targets]
+
+    monkeypatch.setattr(Fleetwide, "look", look)
+
+    code = cosmos(["down", "0009-z", "-i", "pi01,pi02"])
+
+    assert code == 3
+    assert "0009-z: no such run lives on this machine; living runs: none; pi[01:02]" in (
+        capsys.readouterr().err.replace("pi01, pi02", "pi[01:02]")
+    )
+
+
+def test_runs_of_one_name_on_machines_are_told_apart_by_their_folders_there() -> None:
+    folders = ["0001-a-11111111", "0001-a-22222222"]
+    known = [
+        Doomed(
+            run="0001-a",
+            directory=folder,
+            there={
+                "pi01": RecordingMachine(
+                    target=Target(name="pi01", address="pi01"), directory=f"/home/pi/runs/{folder}"
+                )
+            },
+        )
+        for folder in folders
+    ]
+
+    with pytest.raises(InputError, match=f"give the directory: {', '.join(folders)}"):
+        choose(known, ["1"], is_all=False)
+    for which in (folders[1], f"/home/pi/runs/{folders[1]}"):
+        assert choose(known, [which], is_all=False) == known[1:]
 
 
 def test_down_of_nothing_says_of_which_machines_it_is_known(

@@ -148,6 +148,21 @@ def test_records_of_devices_are_of_their_machine_or_of_their_agents() -> None:
     assert sources.owner_of("devices/agent-07/gps/fix.jsonl") == "pi23"
 
 
+def test_records_of_a_machines_device_are_its_own_though_an_agent_elsewhere_is_called_alike(
+    tmp_path: Path,
+) -> None:
+    run = RunDirectory(tmp_path)
+    machines = {"pi01": {"agents": ["pi02"]}, "pi02": {"agents": ["pi01"]}}
+    devices = {"pi01": ["pi01/imu", "pi02/gps"], "pi02": []}
+    run.plan_json.write_text(json.dumps({"machines": machines, "devices": devices}))
+
+    sources = RecordingMachines.read(run)
+
+    assert sources.owner_of("devices/pi01/imu/gyro.jsonl") == "pi01"
+    assert sources.owner_of("devices/pi02/gps/fix.jsonl") == "pi01"
+    assert sources.owner_of("devices/pi02/other/fix.jsonl") == "pi01"
+
+
 PLAYED = {
     "points": 100,
     "played": 90,

@@ -195,6 +195,33 @@ def test_settled_goes_by_the_times_of_records_however_late_they_come(
     assert result.got == settled_s
 
 
+@pytest.mark.parametrize("seed", range(60))
+def test_settled_is_right_though_few_times_are_kept_of_records_that_come_late(seed, monkeypatch):
+    chance = np.random.default_rng(seed)
+    monkeypatch.setattr(records, "BATCH_RECORDS", int(chance.integers(1, 9)))
+    monkeypatch.setattr(accumulators, "TIMES_KEPT", 3)
+    count = int(chance.integers(8, 40))
+    # A time each, some of which come late by up to the whole run.
+    order = np.argsort(np.arange(count) + count * (chance.random(count) < 0.15) * chance.random())
+    t_s, inside = order.astype(float), chance.random(count) < 0.85
+    state = FakeTable(
+        "state", STATE.fields, {"a": {"t_s": t_s, "x_m": np.where(inside, 1.0, -1.0)}}
+    )
+
+    (result,) = judge(
+        expect(
+            statistic="settled",
+            when=ValueBounds(low=0.0),
+            bounds=ValueBounds.below(1e3),
+            agents=("a",),
+        ),
+        tables={"state": state},
+    ).results
+
+    last_s = max(t_s[~inside], default=-1.0)
+    assert result.got == min(t_s[t_s > last_s], default=None)
+
+
 def test_the_worst_agent_is_told_with_its_time_in_the_unit_of_the_check():
     worst = {name: np.abs(values).max() for name, values in DATA.items()}
     agent = max(worst, key=worst.get)
@@ -470,6 +497,29 @@ def test_of_events_of_one_time_the_one_that_is_recorded_later_comes_after(
     assert (by_event.passed, by_value.passed) == (passed, passed)
 
 
+@pytest.mark.parametrize("rows", [1, 65_536])
+@pytest.mark.parametrize(
+    ("t_s", "must", "passed"),
+    [
+        ([0.2, 0.1], "occur", True),
+        ([0.2, 0.1], "not_occur", False),
+        ([0.1, 0.2], "occur", False),
+        ([0.1, 0.2], "not_occur", True),
+    ],
+)
+def test_an_event_comes_after_another_by_its_time_however_early_it_was_recorded(
+    t_s, must, passed, rows, monkeypatch
+):
+    monkeypatch.setattr(records, "BATCH_RECORDS", rows)
+    common = {"stream": "events", "field": "event", "agents": ("a",)}
+    armed = expect(name="armed", event="armed", **common)
+    alarm = expect(name="alarm", event="alarm", must=must, after="armed", **common)
+
+    found = judge(armed, alarm, tables=events_of("alarm", "armed", t_s=t_s)).results[1]
+
+    assert found.passed == passed
+
+
 @pytest.mark.parametrize(
     ("must", "to_s", "passed", "got"),
     [("not_occur", None, False, None), ("not_occur", 1.5, True, 0), ("occur", None, False, None)],
@@ -488,6 +538,18 @@ def test_an_event_that_occurs_too_often_to_be_followed_never_counts_as_absent(
 
     assert (found.passed, found.got) == (passed, got)
     assert ("it occurs 3 times, and the first 2 are looked at" in found.expected) is (got is None)
+
+
+def test_an_event_of_an_early_time_that_was_not_kept_may_be_the_one_that_must_not_be(monkeypatch):
+    monkeypatch.setattr(accumulators, "OCCURRENCES_KEPT", 2)
+    tables = events_of("burn", "burn", "burn", t_s=[8.0, 9.0, 1.0])
+    common = {"stream": "events", "field": "event", "agents": ("a",)}
+
+    found = judge(
+        expect(name="none", event="burn", must="not_occur", to_s=5.0, **common), tables=tables
+    ).results[0]
+
+    assert (found.passed, found.got) == (False, None)
 
 
 def test_an_event_may_come_after_that_of_one_other_agent():
