@@ -187,6 +187,9 @@ def run_suite(
 
     Returns:
         The runs that were made; an interrupted one is the last.
+
+    Raises:
+        InputError: The first one refused its input. A later one counts as ended by it: those before have made their figures.
     """
     done: list[SuiteRun] = []
     ordered = sorted(scenarios, key=lambda each: each.scenario.time.duration_s)
@@ -194,11 +197,16 @@ def run_suite(
         duration_s = scenario.scenario.time.duration_s
         console.say(f"{number} of {len(ordered)}: {scenario.path}, {duration_s:g} s")
         longest_s = scenario.run_config("bench").longest_s
-        outcome = run_child(
-            [path_word(scenario.path), "--runs", str(runs), *options],
-            limit_s=longest_s + 600.0 + COLLECT_SHARE * duration_s,
-            is_quiet=console.quiet,
-        )
+        try:
+            outcome = run_child(
+                [path_word(scenario.path), "--runs", str(runs), *options],
+                limit_s=longest_s + 600.0 + COLLECT_SHARE * duration_s,
+                is_quiet=console.quiet,
+            )
+        except InputError as error:
+            if not done:
+                raise
+            outcome = ChildRunOutcome(exit_code=ExitCode.BAD_INPUT, last_words=str(error))
         document = _with_benchmark(outcome, runs, console)
         done.append(SuiteRun(scenario=scenario, outcome=outcome, document=document))
         if done[-1].round_trips:

@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+import pytest
+
 from cosmos_cli.bench import suite
 from cosmos_cli.bench.child_run import ChildRunOutcome
 from cosmos_cli.bench.suite import ROUND_TRIPS, SUMMARY, SuiteRun
-from cosmos_cli.errors import ExitCode
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.ui.console import Console
 
 SCENARIO = Path(__file__).parents[3] / "scenarios" / "thesis" / "benchmark_at_once.yaml"
 
@@ -43,3 +46,28 @@ def test_ticks_are_those_that_were_done_in_the_table_of_a_run_and_in_that_of_all
 
     assert [told(ROUND_TRIPS, row) for row in made.rows()] == [("398", "9")] * 2
     assert [told(SUMMARY, row) for row in made.summary_rows()] == [("398", "9")]
+
+
+def test_a_run_that_refuses_its_input_later_costs_no_figure_of_those_before(monkeypatch, capsys):
+    """As one whose inventory was changed meanwhile."""
+    made = ChildRunOutcome(exit_code=0, document={"run": "", "verdict": "PASSED"})
+    answers = [made, InputError("tower.yaml:3: expected a machine"), made]
+
+    def run_child(words, *, limit_s, is_quiet):
+        answer = answers.pop(0)
+        if isinstance(answer, InputError):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(suite, "run_child", run_child)
+    console = Console(json=False, quiet=False)
+    scenarios = [load_scenario(SCENARIO)] * 3
+
+    done = suite.run_suite(scenarios, [], Path("runs"), console)
+
+    assert [each.outcome.exit_code for each in done] == [0, 2, 0]
+    assert suite.suite_exit_code(done) == 2
+    assert "tower.yaml:3: expected a machine" in capsys.readouterr().err
+    answers = [InputError("tower.yaml:3: expected a machine")]
+    with pytest.raises(InputError):
+        suite.run_suite(scenarios, [], Path("runs"), console)
