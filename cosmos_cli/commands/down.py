@@ -130,28 +130,24 @@ def down(
         tell=failure_teller(console),
     )
     outcomes = fleet.look(targets)
-    known = known_runs(living_runs(), unfinished_runs())
-    known += found_runs(known, targets, outcomes)
+    known = _every_run(targets, outcomes)
     unasked = [outcome.machine for outcome in failed(outcomes)]
     if all_ and limit is not None:
         known = [run for run in known if run.is_on(listed)]
     chosen = choose(known, runs or [], is_all=all_, unasked=unasked)
     ended = [_end(run, fleet, timeout_s, console.say) for run in chosen]
     bad = [each for one in ended for each in failed(one.there)] + failed(outcomes)
-    for one in ended:
-        for line in _lines(one):
-            console.data(line)
+    for line in (line for one in ended for line in _lines(one)):
+        console.data(line)
     if not chosen:
         where = where_words(len(outcomes) - len(unasked))
         console.say(f"no run lives {where}{_unasked_words(unasked)}")
-    failures = [outcome.failure for outcome in bad]
     named = ["--all"] if all_ else runs or []
+    failures = [outcome.failure for outcome in bad]
     ask_whether_moved(console, failures, inventory, shlex.join(["down", *named]))
-    is_left = any(one.is_left for one in ended)
-    exit_code = ExitCode.RUN_FAILED if is_left else ExitCode.MACHINES if bad else ExitCode.OK
+    exit_code = _exit_code(ended, bad)
     # Runs that begin meanwhile are not to end by a repetition.
-    again = [] if all_ else [outcome.machine for outcome in bad]
-    retry = offer_retry_of(console, inventory, targets, again)
+    retry = None if all_ else offer_retry_of(console, inventory, targets, [o.machine for o in bad])
     console.print_json(
         {
             "runs": [_mapping(one) for one in ended],
@@ -161,6 +157,18 @@ def down(
         }
     )
     return int(exit_code)
+
+
+def _exit_code(ended: Sequence[Ended], bad: Sequence[Outcome[Any]]) -> ExitCode:
+    if any(one.is_left for one in ended):
+        return ExitCode.RUN_FAILED
+    return ExitCode.MACHINES if bad else ExitCode.OK
+
+
+def _every_run(targets: Sequence[Target], outcomes: Sequence[Outcome[list[Seen]]]) -> list[Doomed]:
+    """Return the runs that are known here, and those that were seen on machines besides."""
+    known = known_runs(living_runs(), unfinished_runs())
+    return known + found_runs(known, targets, outcomes)
 
 
 def known_runs(here: Sequence[LivingRun], unfinished: Sequence[RunDirectory]) -> list[Doomed]:

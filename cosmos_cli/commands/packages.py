@@ -30,7 +30,7 @@ from cosmos_cli.fleet.fleet import Fleet
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.outcome import InOrder, Outcome, failed
-from cosmos_cli.fleet.target import require_root
+from cosmos_cli.fleet.target import Target, require_root
 from cosmos_cli.onboard.apt_words import PYTHON_HINT
 from cosmos_cli.ui.console import WORK_GOES_ON, Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
@@ -42,6 +42,7 @@ PIECE_TIMEOUT_S = 60.0
 TIMEOUT_S = 1800.0
 ANSWER_MARGIN_S = 60.0
 """The machine itself ends its work in time, and says so."""
+ROOT_ADVICE = "leave that machine out with --limit"
 NAMES_SHOWN_MAX = 5
 NAME = re.compile(r"[a-z0-9][a-z0-9+.-]*[a-z0-9+.](?::[a-z0-9-]+)?(?:=[A-Za-z0-9.+:~-]+)?")
 """A package's name, perhaps with its architecture and a version; one that ends in - would be removed."""
@@ -152,11 +153,10 @@ def _change(
 def _change_one(connection: Connection, arguments: dict[str, Any]) -> Changed:
     """Work on one machine; what is said meanwhile is a sign of life."""
     target, is_check = connection.target, bool(arguments["is_check"])
-    if not is_check:
-        require_root(target, "leave that machine out with --limit")
     last: Changed = {}
     with Helper.start(connection, PARTS) as helper:
         if not is_check:
+            _require_root(helper, target)
             helper.call("lock", {"path": Layout(target.root).lock, "holder": "cosmos packages"})
         for part in helper.parts(
             "packages",
@@ -166,9 +166,17 @@ def _change_one(connection: Connection, arguments: dict[str, Any]) -> Changed:
             whole_s=float(arguments["timeout_s"]) + ANSWER_MARGIN_S,
         ):
             last = dict(part.value)
-    if "changes" not in last:
-        raise MachineFailure(FailureKind.DATA, "ended without saying what it changed")
+        if "changes" not in last:
+            raise MachineFailure(FailureKind.DATA, "ended without saying what it changed")
+        if is_check and last["changes"]:
+            _require_root(helper, target)
+            helper.call("look", as_root=True)  # what the change itself would meet: sudo's refusal
     return last
+
+
+def _require_root(helper: Helper, target: Target) -> None:
+    if helper.greeting["uid"] != 0:  # who is root already becomes nobody
+        require_root(target, ROOT_ADVICE)
 
 
 def _is_changed(outcome: Outcome[Changed]) -> bool:

@@ -14,13 +14,15 @@ from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
 from cosmos_cli.fleet.target import Target, require_root
 from cosmos_cli.onboard.request_loop import BOOT_ID_FILE
+from madns_runtime.plain_values import first_few
 
-PARTS = ("madns_runtime.processes", "processes", "scratch", "power")
+PARTS = ("madns_runtime.processes", "processes", "scratch", "files", "power")
 TRY_INTERVAL_S = 1.0
 REFUSED_INTERVAL_S = 5.0
 """After a refused login: a machine that is starting refuses everybody, and sshd is slow to forgive."""
 TRY_TIMEOUT_S = 5.0
 ORDER_TIMEOUT_S = 15.0
+RUNS_SHOWN_MAX = 5
 ROOT_ADVICE = "leave that machine out with --limit, or reboot it by hand"
 FINAL = (FailureKind.HOST_KEY_CHANGED, FailureKind.HOST_KEY_UNKNOWN)
 """Failures that more patience does not mend."""
@@ -88,7 +90,7 @@ class Rebooting:
             if helper.greeting["uid"] != 0:  # who is root already becomes nobody
                 require_root(connection.target, ROOT_ADVICE)
             if not self.is_forced:
-                refuse_if_living(told["living"])
+                refuse_if_living(told["living"], told["others"])
                 if told["has_root"]:
                     _take_lock(helper, layout)
             start_s = time.monotonic()
@@ -143,19 +145,23 @@ def same_words(name: str) -> str:
     return f"it is {name}, under another name"
 
 
-def refuse_if_living(living: Sequence[Mapping[str, Any]]) -> None:
+def refuse_if_living(living: Sequence[Mapping[str, Any]], others: Sequence[str] = ()) -> None:
     """
-    Let nobody take a machine away from a run.
+    Let nobody take a machine away from a run, be it of another user or another folder there.
 
     Raises:
         MachineFailure: BUSY, with the runs that live there.
     """
-    runs = sorted({str(entry["run"]) for entry in living})
+    own = sorted({str(entry["run"]) for entry in living})
+    runs = [*own, *others]
     if runs:
+        end = (
+            "`cosmos down`" if own else "`cosmos down` with the inventory and user that started it"
+        )
         raise MachineFailure(
             FailureKind.BUSY,
-            f"{', '.join(runs)} {'lives' if len(runs) == 1 else 'live'} there",
-            "`cosmos down` ends a run; --force reboots all the same",
+            f"{first_few(runs, RUNS_SHOWN_MAX)} {'lives' if len(runs) == 1 else 'live'} there",
+            f"{end} ends a run; --force reboots all the same",
         )
 
 

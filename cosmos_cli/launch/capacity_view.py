@@ -19,7 +19,7 @@ LIMITS = (Column("limit"), Column("agents at most", is_number=True), Column("why
 
 
 class _Place(NamedTuple):
-    """What tells one computer from another without asking it."""
+    """Key that tells one computer from another without asking it."""
 
     address: str
     port: int | None

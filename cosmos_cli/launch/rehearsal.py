@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ from cosmos_cli.models.machine_facts import NOEXEC_CURE, MachineFacts
 from cosmos_cli.provision import STORE_PARTS
 from cosmos_cli.provision.before_run import Cargo, cargo_of, environment_key_of
 from cosmos_cli.provision.environment import ask_installed, installed_request
+from cosmos_cli.ui import invocation
 from cosmos_cli.ui.sizes import size_words
 from madns_runtime.timing.rate import count_ticks
 
@@ -99,10 +101,12 @@ class MachineRehearsal:
             found.append(Obstacle(text=text, cure=NOEXEC_CURE))
         needed = max(FREE_BYTES_MIN, self.bytes_missing + self.record_bytes)
         if disk.free_bytes < needed:
+            inventory = invocation.current().inventory_options
+            wipe = f"`cosmos wipe{inventory} --limit {shlex.quote(name)}`"
             found.append(
                 Obstacle(
                     text=f"{size_words(disk.free_bytes)} free, {size_words(needed)} needed",
-                    cure=f"cosmos collect, then cosmos wipe --limit {name}",
+                    cure=f"`cosmos collect RUN`, then {wipe}",
                 )
             )
         if self.is_udp_tried and self.round_trip_ms is None:

@@ -282,7 +282,7 @@ def _with_workers(entries: Sequence[ProcessEntry], directory: str) -> tuple[Proc
             and is_running(entry)
             and _told(os.getsid, entry.pid) == entry.pid
         ):
-            for pid in _processes():
+            for pid in process_numbers():
                 if pid not in found and _told(os.getpgid, pid) == entry.pid:
                     _add_worker(found, pid, entry)
     pattern = _pattern(entries, directory)
@@ -315,7 +315,8 @@ def _add_worker(found: dict[int, ProcessEntry], pid: int, leader: ProcessEntry) 
         found[pid] = dataclasses.replace(leader, pid=pid, start_ticks=start_ticks, name=name)
 
 
-def _processes() -> Iterator[int]:
+def process_numbers() -> Iterator[int]:
+    """Yield the numbers of all processes here."""
     with os.scandir("/proc") as folders:
         yield from (int(folder.name) for folder in folders if folder.name.isdecimal())
 
@@ -324,7 +325,7 @@ def started_with(variable: str, value: str) -> list[int]:
     """Return the living processes of this user that have a variable in their environment, but not this one."""
     mark = f"{variable}={value}".encode()
     found = []
-    for pid in _processes():
+    for pid in process_numbers():
         try:
             is_marked = mark in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
         except NOT_THERE:  # another user's, or it has just ended
@@ -336,7 +337,7 @@ def started_with(variable: str, value: str) -> list[int]:
 
 def _writers(directory: str) -> Iterator[tuple[int, str]]:
     """Yield each process of this user that has a file below a directory open for writing."""
-    for pid in _processes():
+    for pid in process_numbers():
         if pid != os.getpid() and (path := _written_by(pid, directory)):
             yield pid, f"pid {pid} writes {os.path.relpath(path, directory)}"
 

@@ -15,6 +15,7 @@ from cosmos_cli.models.machine_facts import MachineFacts, SystemPaths
 from cosmos_cli.models.provision_steps import LineInFile, ProvisionStep, ShellCommand
 from cosmos_cli.provision.inventory_steps import DeclaredStep
 from cosmos_cli.provision.step import Done
+from cosmos_cli.ui import invocation
 
 
 def membership(group: str) -> dict[str, Any]:
@@ -60,13 +61,14 @@ def boot_notes(facts: MachineFacts, needs: MachineNeeds, paths: SystemPaths) -> 
         )
 
 
-def reboot_notes(done: Sequence[Done], paths: SystemPaths, machine: str) -> Iterator[str]:
-    """Yield a note if a machine's boot configuration was changed."""
+def reboot_notes(done: Sequence[Done], paths: SystemPaths) -> Iterator[str]:
+    """Yield a note if a machine's boot configuration was changed; the same for all machines of a command."""
+    machines = invocation.current().machine_options
     for path in paths.boot_configurations:
         if any(
             each.changed and each.step.change and each.step.change.path == path for each in done
         ):
-            yield f"{path} was changed, which counts from its next start on: `cosmos reboot --limit {machine}`"
+            yield f"{path} was changed, which counts from its next start on: `cosmos reboot{machines}`"
 
 
 def _configuration(facts: MachineFacts, paths: SystemPaths) -> str:

@@ -2,7 +2,8 @@
 The plan of settings, of which `cosmos_cli.models.inventory.settings` has the table. Pure.
 
 What was there before is remembered on the machine before anything changes, and put back when the inventory
-no longer asks for the setting.
+no longer asks for the setting. A machine has one file of each setting, but perhaps several users and folders of COSMoS,
+each with a memory of its own: the file names the one that wrote it, and nobody else takes it away.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from cosmos_cli.provision.desired import DesiredState
 from cosmos_cli.provision.step import Change, Kind, Step, StepRequest
 
 HEADER = "# Written by `cosmos up` for {variable}; it takes it away when the inventory no longer asks for it.\n"
+CLAIM = "# for "
+"""Begin of the lines below the header that name a user and a folder of COSMoS; older versions wrote none."""
 MEMORY_SCHEMA = 1
 
 
@@ -77,6 +80,8 @@ class _Plan:
 
     def make(self, setting: Setting, value: Any) -> Iterator[Step]:
         path, text, found = self._file_of(setting, value)
+        if self._is_said(setting, found.text, text):
+            text = found.text or ""
         live = setting.live(self.facts, self.desired.paths)
         wish = setting.wish(value)
         different = [[where, wish] for where, present in live.items() if present != wish]
@@ -87,7 +92,8 @@ class _Plan:
             raise MachineFailure(FailureKind.UNSUPPORTED, *refusal)
         requests = []
         if setting.key not in self.memory:
-            former = None if _is_ours(setting, found.text) else found.text
+            is_leftover = _is_ours(setting, found.text) and not self._is_of_another(setting, found)
+            former = None if is_leftover else found.text
             self.memory[setting.key] = {"file": former, "values": live}
             requests.append(self._remember())
         if found.text != text:
@@ -109,7 +115,12 @@ class _Plan:
     def put_back(self, setting: Setting) -> Iterator[Step]:
         path, others, found = self._file_of(setting, None)
         known = self.memory.get(setting.key)
-        if known is None and (not _is_ours(setting, found.text) or found.text == others):
+        is_of_another = self._is_of_another(setting, found)
+        is_left = _is_ours(setting, found.text) and found.text != others and not is_of_another
+        if known is None and not is_left:
+            return
+        if known is not None and is_of_another:
+            yield self._leave(setting, path, found)
             return
         before = others or (known or {}).get("file")
         values = self._former_values(setting, (known or {}).get("values") or {})
@@ -143,17 +154,54 @@ class _Plan:
         if found.kind in ("directory", "other") or (found.kind == "file" and found.text is None):
             text = f"{path}: expected a small file of text, or none"
             raise MachineFailure(FailureKind.STEP, text, "remove it there")
-        lines = self._lines_of_others(setting, found.text)
+        lines, claims = self._lines_of_others(setting, found.text)
         if value is not None:
             lines.append(setting.line(value, self.facts))
-        text = "".join(f"{line}\n" for line in sorted(lines))
-        return path, text and _head(setting) + text, found
+            claims.append(f"{self.facts.user} {self.desired.layout.root}")
+        told = [*(CLAIM + claim for claim in sorted(claims)), *sorted(lines)]
+        text = _head(setting) + "".join(f"{line}\n" for line in told)
+        return path, text if lines else "", found
 
-    def _lines_of_others(self, setting: Setting, text: str | None) -> list[str]:
-        """Return what the file holds for other logins: each has a memory of its own there, but the file is one."""
+    def _lines_of_others(self, setting: Setting, text: str | None) -> tuple[list[str], list[str]]:
+        """Return what the file holds for other logins, and their claims: it is one for all of them."""
         lines = (text or "").splitlines() if _is_ours(setting, text) else ()
         said = (line for line in lines if line.strip() and not line.startswith("#"))
-        return [line for line in said if not setting.is_own(line, self.facts)]
+        claims = (claim for claim in _claims(text) if not setting.is_own(claim, self.facts))
+        return [line for line in said if not setting.is_own(line, self.facts)], [*claims]
+
+    def _claim(self, setting: Setting, text: str | None) -> str | None:
+        """Return the user and the folder that a file names as its own; None if it names none, as of older versions."""
+        claims = _claims(text) if _is_ours(setting, text) else ()
+        return next((claim for claim in claims if setting.is_own(claim, self.facts)), None)
+
+    def _is_of_another(self, setting: Setting, found: FileFact) -> bool:
+        """Tell whether a file is another's: of another folder, or, where nothing is remembered here, of another user."""
+        claim, root = self._claim(setting, found.text), self.desired.layout.root
+        if claim is None:
+            return False
+        is_known = setting.key in self.memory  # a user whose name changed has the same memory
+        return claim.split()[-1] != root or not (is_known or claim == f"{self.facts.user} {root}")
+
+    def _is_said(self, setting: Setting, found: str | None, text: str) -> bool:
+        """
+        Tell whether a file says already what it should, no matter whose it is: two must not write it in turns.
+
+        One that names nobody is written once more where the memory tells that it is ours.
+        """
+        if not _is_ours(setting, found) or _without_claims(found) != _without_claims(text):
+            return False
+        return self._claim(setting, found) is not None or setting.key not in self.memory
+
+    def _leave(self, setting: Setting, path: str, found: FileFact) -> Step:
+        """Return the step that only forgets: another wrote the file since, who puts back what was there."""
+        del self.memory[setting.key]
+        return Step(
+            kind=Kind.SETTING,
+            title=f"setting {setting.variable}: leave to {self._claim(setting, found.text)}",
+            requests=(self._remember(),),
+            subject=setting.key,
+            change=Change(path=path, before=found.text, after=found.text),
+        )
 
     def _former_values(self, setting: Setting, former: Mapping[str, str]) -> list[list[str]]:
         """Return the values to put back; one that has come since, or has another name now, is like its kin."""
@@ -180,6 +228,16 @@ def _head(setting: Setting) -> str:
 
 def _is_ours(setting: Setting, text: str | None) -> bool:
     return text is not None and text.startswith(_head(setting))
+
+
+def _claims(text: str | None) -> list[str]:
+    lines = (text or "").splitlines()
+    said = (line[len(CLAIM) :].strip() for line in lines if line.startswith(CLAIM))
+    return [claim for claim in said if claim]
+
+
+def _without_claims(text: str | None) -> list[str]:
+    return [line for line in (text or "").splitlines() if not line.startswith(CLAIM)]
 
 
 def _write(path: str, text: str) -> StepRequest:

@@ -251,7 +251,7 @@ class MachineUp:
             facts = dataclasses.replace(facts, realtime_priority_max=granted)
         self.result.notes += notes_of(facts, desired)
         if not self.options.is_check:
-            self.result.notes += reboot_notes(self.result.done, desired.paths, self.machine.name)
+            self.result.notes += reboot_notes(self.result.done, desired.paths)
 
     def _granted_to_new_login(self) -> int | None:
         """Return the real-time priority that a login of now is granted; None for no limit, and where it is not known."""

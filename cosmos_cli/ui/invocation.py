@@ -47,11 +47,16 @@ class Invocation:
 
         Of COSMOS_INVENTORY nothing, as the other command reads it, too; INVENTORY where nobody named any.
         """
-        inventories, limits = self._values_of(INVENTORY), self._values_of(LIMIT)
+        limits = (f" --limit {shlex.quote(each)}" for each in self._values_of(LIMIT))
+        return self.inventory_options + "".join(limits)
+
+    @property
+    def inventory_options(self) -> str:
+        """Return -i alone, as in `machine_options`, for a command that names its own machines."""
+        inventories = self._values_of(INVENTORY)
         if not inventories and not os.environ.get(INVENTORY_VARIABLE):
             inventories = ["INVENTORY"]
-        words = [f" -i {shlex.quote(each)}" for each in inventories]
-        return "".join(words + [f" --limit {shlex.quote(each)}" for each in limits])
+        return "".join(f" -i {shlex.quote(each)}" for each in inventories)
 
     def _values_of(self, names: Sequence[str]) -> list[str]:
         """Return the values that an option was given."""

@@ -263,7 +263,14 @@ _DOCTOR: Mapping[str, Shape] = {
 _ANSWERS: Mapping[str, Callable[[Asked], Shape]] = {
     "blobs": _always(nothing),
     "boot": _always(
-        record({"boot_id": name, "living": list_of(record(process)), "has_root": flag})
+        record(
+            {
+                "boot_id": name,
+                "living": list_of(record(process)),
+                "others": list_of(text()),
+                "has_root": flag,
+            }
+        )
     ),
     "check_runtime": _always(
         record({"runtime": name, "start_ms": number, "round_trip_ms": maybe(number)})

@@ -25,12 +25,12 @@ class InventoryGroup:
     priority: int = 1
     variables: dict[str, Any] = field(default_factory=dict)
     """Of the inventory itself."""
-    file_variables: dict[str, Any] = field(default_factory=dict)
-    """Of group_vars, which win over those of every group in the inventory itself."""
+    file_variables: dict[int, dict[str, Any]] = field(default_factory=dict)
+    """Of group_vars by the number of their source; they win over those of every group in the inventory itself."""
     folders: dict[bool, Path] = field(default_factory=dict)
     """Folder from which the files of its steps are found: for `variables` under False, `file_variables` under True."""
-    device_folders: dict[bool, Path] = field(default_factory=dict)
-    """The same of the files of its devices."""
+    device_folders: dict[int | None, Path] = field(default_factory=dict)
+    """Folder of the files of its devices: for `variables` under None, `file_variables` under their source's number."""
     children: dict[str, None] = field(default_factory=dict)
     parents: dict[str, None] = field(default_factory=dict)
     machines: dict[str, None] = field(default_factory=dict)

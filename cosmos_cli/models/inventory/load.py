@@ -85,8 +85,9 @@ def read_inventory(given: Given) -> Inventory:
         place = 1 if is_one else None
         reader.faults.append(Fault(text=text, file=", ".join(sources), line=place, column=place))
     reader.finish()
-    for source in sources:
+    for number, source in enumerate(sources):
         if not is_machine_list(source):
+            reader.source = number
             _read_variable_files(reader, folder_of(source))
     faults = reader.all_faults()
     if faults:
@@ -129,11 +130,14 @@ def _read_variable_files(reader: Reader, folder: Path) -> None:
 
 def _said_by(entity: InventoryGroup | MachineEntry) -> Variables:
     """Return what one group or machine says of the lists that add up; steps find their files from its folder."""
-    values = entity.variables | entity.file_variables
+    values = dict(entity.variables)
+    for variables in entity.file_variables.values():
+        values |= variables
     said = Variables.of({name: values[name] for name in UNITED_NAMES if name in values})
     if not said.cosmos_provision:
         return said
-    folder = entity.folders.get(PROVISION in entity.file_variables, Path())
+    is_of_file = any(PROVISION in each for each in entity.file_variables.values())
+    folder = entity.folders.get(is_of_file, Path())
     steps = tuple(step.with_source_in(folder) for step in said.cosmos_provision)
     return said.model_copy(update={PROVISION: steps})
 
@@ -175,17 +179,31 @@ def _union(layers: Iterable[Variables], name: str) -> tuple[Any, ...]:
 
 
 def _devices_folder(entry: MachineEntry, groups: list[InventoryGroup]) -> Path:
-    """Return the folder of the list of devices that wins, in the order of `_layers`."""
-    found = [group.device_folders.get(False) for group in groups]
-    found += [group.device_folders.get(True) for group in groups]
-    found += [entry.device_folders.get(False), entry.device_folders.get(True)]
+    """Return the folder of the list of devices that wins."""
+    found = [entity.device_folders.get(source) for entity, source in _places(entry, groups)]
     folder = next((folder for folder in reversed(found) if folder is not None), None)
     return Path() if folder is None else folder.absolute()  # a working folder may be gone
 
 
 def _layers(entry: MachineEntry, groups: list[InventoryGroup]) -> Iterator[Mapping[str, Any]]:
-    """Yield variables in Ansible's order: files of variables win over every group in the inventory itself."""
-    yield from (group.variables for group in groups)
-    yield from (group.file_variables for group in groups)
-    yield entry.variables
-    yield entry.file_variables
+    """Yield variables in Ansible's order."""
+    for entity, source in _places(entry, groups):
+        yield entity.variables if source is None else entity.file_variables[source]
+
+
+def _places(
+    entry: MachineEntry, groups: list[InventoryGroup]
+) -> Iterator[tuple[InventoryGroup | MachineEntry, int | None]]:
+    """
+    Yield where variables stand, the weakest first, as in Ansible: an entity, and its source or None for the inventory.
+
+    Files of variables win over every group in the inventory itself. Those of `all` are the weakest of all
+    sources; of the other groups a later source's win over an earlier one's, however strong the group.
+    """
+    yield from ((group, None) for group in groups)
+    whole, *others = groups  # `all` alone has no depth
+    yield from ((whole, source) for source in whole.file_variables)
+    for source in sorted({source for group in others for source in group.file_variables}):
+        yield from ((group, source) for group in others if source in group.file_variables)
+    yield entry, None
+    yield from ((entry, source) for source in entry.file_variables)

@@ -37,11 +37,11 @@ class MachineEntry:
     """An empty fault at the place where it is named first."""
     variables: dict[str, Any] = field(default_factory=dict)
     """Of the inventory itself."""
-    file_variables: dict[str, Any] = field(default_factory=dict)
-    """Of host_vars, which win."""
+    file_variables: dict[int, dict[str, Any]] = field(default_factory=dict)
+    """Of host_vars by the number of their source, which win."""
     folders: dict[bool, Path] = field(default_factory=dict)
     """Folders, as of a group."""
-    device_folders: dict[bool, Path] = field(default_factory=dict)
+    device_folders: dict[int | None, Path] = field(default_factory=dict)
     """Folders, as of a group."""
 
 
@@ -51,6 +51,8 @@ class Reader:
 
     folder: Path = Path()
     """Of the source that is being read, from which the files that its steps name are found."""
+    source: int | None = None
+    """Number of the source whose group_vars and host_vars are being read; None while inventories themselves are."""
     tree: GroupTree = field(default_factory=GroupTree)
     machines: dict[str, MachineEntry] = field(default_factory=dict)
     """In the order of the file."""
@@ -96,7 +98,7 @@ class Reader:
         """Take over the variables of a file of group_vars or host_vars."""
         self.scalar_faults += document.faults
         self.faults += variable_faults(document, (), document.value, self.folder)
-        self._keep(entity, document.value, is_file=True)
+        self._keep(entity, document.value)
 
     def all_faults(self) -> list[Fault]:
         """Return every fault once, file by file in the order they were read, and from top to bottom."""
@@ -201,20 +203,17 @@ class Reader:
             self._keep(entry, variables)
             self.tree.groups[group].machines[name] = None
 
-    def _keep(
-        self,
-        entity: InventoryGroup | MachineEntry,
-        variables: Mapping[str, Any],
-        *,
-        is_file: bool = False,
-    ) -> None:
+    def _keep(self, entity: InventoryGroup | MachineEntry, variables: Mapping[str, Any]) -> None:
         """Add variables to those of a group or a machine, and remember where the files of its steps are."""
-        kept = entity.file_variables if is_file else entity.variables
+        is_file = self.source is not None
+        kept = entity.variables
+        if self.source is not None:
+            kept = entity.file_variables.setdefault(self.source, {})
         kept.update(variables)
         if PROVISION in variables:
             entity.folders[is_file] = self.folder
         if DEVICES in variables:
-            entity.device_folders[is_file] = self.folder
+            entity.device_folders[self.source] = self.folder
 
     def _is_mapping(
         self, value: Any, document: Document, path: ValuePath

@@ -30,6 +30,7 @@ TOLD: dict[str, Any] = {
     ],
     "pi03": MachineFailure(FailureKind.BUSY, "locked", "wait"),
 }
+TOLD |= dict.fromkeys(("pi04", "pi05"), TOLD["pi02"])
 
 
 @pytest.mark.parametrize("name", ["i2c-tools", "libfoo2++", "foo:armhf", "foo=1.2-3~deb12u1+b1"])
@@ -59,18 +60,27 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any], bo
     class PlayedBoard:
         def __init__(self, name: str) -> None:
             self.name = name
+            self.greeting = {"uid": 1000}
 
         @classmethod
         def start(cls, connection: Connection, parts: object) -> PlayedBoard:
             return cls(connection.target.name)
 
-        def call(self, verb: str, arguments: dict[str, Any]) -> None:
-            asked.append((verb, arguments, False))
+        def call(
+            self, verb: str, arguments: dict[str, Any] | None = None, *, as_root: bool = False
+        ) -> None:
+            self.refuse(as_root)
+            asked.append((verb, arguments or {}, as_root))
+
+        def refuse(self, as_root: bool) -> None:
+            if as_root and self.name == "pi05":
+                raise MachineFailure(FailureKind.NO_SUDO, "a password is required", "allow it")
 
         def parts(
             self, verb: str, arguments: dict[str, Any], *, as_root: bool, **deadlines: float
         ) -> Any:
             assert set(deadlines) == {"timeout_s", "whole_s"}
+            self.refuse(as_root)
             asked.append((verb, arguments, as_root))
             told = TOLD[self.name]
             if isinstance(told, MachineFailure):
@@ -125,13 +135,28 @@ def test_each_machine_tells_what_changed(
     assert {is_root for verb, _, is_root in asked if verb == "packages"} == {True}
 
 
-def test_check_takes_no_lock_and_needs_no_root(
+@pytest.mark.parametrize("name", ["pi04", "pi05"])
+def test_check_fails_where_nobody_may_become_root_for_the_change(
+    asked: list[Any], inventory: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    inventory.write_text("all: {hosts: {pi04: {ansible_become: false}, pi05: {}}}\n")
+    told = []
+    for words in ([], ["--check"]):
+        code = cosmos(["packages", "upgrade", "-i", str(inventory), "-l", name, *words])
+        told.append((code, capsys.readouterr().out.splitlines()[0]))
+
+    assert told[0] == told[1]
+    assert told[0][0] == 3
+
+
+def test_check_takes_no_lock_and_changes_nothing_as_root(
     asked: list[Any], inventory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = cosmos(["packages", "upgrade", "--check", "-i", str(inventory), "-l", "pi02", "--json"])
 
     answer = json.loads(capsys.readouterr().out)
-    ((verb, arguments, is_root),) = asked
+    (verb, arguments, is_root), *after = asked
     assert (code, verb, arguments["is_check"], is_root) == (0, "packages", True, False)
+    assert after == [("look", {}, True)]
     assert (answer["changed"], answer["failed"], answer["is_check"]) == (1, 0, True)
     assert answer["machines"][0]["changes"][0] == {"name": "bar", "old": None, "new": "1.0"}

@@ -45,6 +45,7 @@ class PlayedBoard:
     """Answers as told; what it was asked is in `asked`."""
 
     living: Sequence[dict[str, str]] = ()
+    others: Sequence[str] = ()
     greeting: Mapping[str, Any] = MappingProxyType({"uid": 1000, "node": "pi01"})
     failures: dict[str, MachineFailure]
     asked: list[str]
@@ -57,7 +58,7 @@ class PlayedBoard:
         self.asked.append(verb)
         if verb in self.failures:
             raise self.failures[verb]
-        told = {"boot_id": "old", "living": self.living, "has_root": True}
+        told = {"boot_id": "old", "living": self.living, "others": self.others, "has_root": True}
         return type("Answer", (), {"value": told})()
 
     def __enter__(self) -> Self:
@@ -169,6 +170,18 @@ def test_machine_with_a_run_is_left_to_it(board: type[PlayedBoard]) -> None:
         rebooting("new").reboot(PlayedConnection())
 
     assert failure.value.kind is FailureKind.BUSY
+    assert "reboot" not in board.asked
+
+
+def test_machine_with_a_run_of_somebody_else_is_left_to_it(board: type[PlayedBoard]) -> None:
+    board.others = ["0009-other in /srv/second/runs", "a run of anna"]
+
+    with pytest.raises(MachineFailure) as failure:
+        rebooting("new").reboot(PlayedConnection())
+
+    assert failure.value.kind is FailureKind.BUSY
+    assert failure.value.text == "0009-other in /srv/second/runs, a run of anna live there"
+    assert "the inventory and user that started it" in failure.value.advice
     assert "reboot" not in board.asked
 
 

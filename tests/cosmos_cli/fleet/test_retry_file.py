@@ -51,7 +51,6 @@ def files(tmp_path):
         ("wipe", ["--yes"]),
         ("up", []),
         ("ps", []),
-        ("down", ["--all"]),
     ],
 )
 def test_machines_that_failed_are_kept_and_the_command_is_named(
@@ -68,6 +67,15 @@ def test_machines_that_failed_are_kept_and_the_command_is_named(
     assert shlex.join(again) in error
     assert stat.S_IMODE(kept.stat().st_mode) == 0o600
     assert stat.S_IMODE(kept.parent.stat().st_mode) == 0o700
+
+
+@pytest.mark.process
+def test_end_of_all_runs_is_repeated_for_nobody(inventory, tmp_path, capsys):
+    """Runs that begin meanwhile would end, too."""
+    assert run(["down", "-i", inventory, "--all", "--json"]) == 3
+
+    assert json.loads(capsys.readouterr().out)["retry"] is None
+    assert files(tmp_path) == []
 
 
 def test_command_that_is_named_works_on_those_machines(inventory, tmp_path, capsys):
@@ -149,13 +157,18 @@ def test_limit_of_a_command_line_is_replaced(words, rest):
 def test_machines_of_a_command_line_are_told_to_another(words, told, monkeypatch):
     monkeypatch.delenv("COSMOS_INVENTORY", raising=False)
 
-    assert Invocation(verb="up", words=tuple(words), valued=VALUED).machine_options == told
+    invocation = Invocation(verb="up", words=tuple(words), valued=VALUED)
+
+    assert invocation.machine_options == told
+    assert invocation.inventory_options == told.split(" --limit")[0]
 
 
 def test_inventory_that_the_environment_names_is_not_told(monkeypatch):
     monkeypatch.setenv("COSMOS_INVENTORY", "a.yaml")
 
-    assert Invocation(verb="run", words=("s.yaml",), valued=VALUED).machine_options == ""
+    invocation = Invocation(verb="run", words=("s.yaml",), valued=VALUED)
+
+    assert (invocation.machine_options, invocation.inventory_options) == ("", "")
 
 
 def test_limit_behind_bundled_options_is_replaced_before_words_for_machines():

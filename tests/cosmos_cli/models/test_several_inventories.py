@@ -39,7 +39,21 @@ OTHER = {
         "hosts": {"pi01": {"v_c": 2}, "alone": {"v_a": 3}},
     }
 }
+NESTED = {
+    "all": {
+        "children": {
+            "outer": {"children": {"inner": {"hosts": {"pi01": {}}}}},
+            "above": {"hosts": {"pi01": {}}},
+        }
+    }
+}
 VARIABLES = {
+    "inside/group_vars/inner.yml": {"v_a": 31, "v_b": 31, "v_c": 31},
+    "inside/group_vars/all.yml": {"v_d": 31},
+    "inside/group_vars/outer.yml": {"v_e": 31},
+    "outside/group_vars/outer.yml": {"v_a": 32, "v_d": 32},
+    "outside/group_vars/above.yml": {"v_b": 32},
+    "outside/group_vars/all.yml": {"v_c": 32, "v_d": 33, "v_e": 32},
     "one/group_vars/tower.yml": {"v_b": 11, "v_d": 1},
     "one/host_vars/pi02.yml": {"v_c": 11},
     "two/group_vars/all.yml": {"v_d": 22},
@@ -60,6 +74,9 @@ CASES = {
     "a list": ["pi01, pi02:2200 ,pi03"],
     "one machine": ["listed,"],
     "two lists": ["b,a,", "c,a,"],
+    "a weaker group's file later": ["inside/i.yaml", "outside/i.yaml"],
+    "a stronger group's file later": ["outside/i.yaml", "inside/i.yaml"],
+    "a weaker group's file between": ["inside", "outside", "inside"],
 }
 
 
@@ -72,6 +89,8 @@ def write(path, value):
 def place(tmp_path, monkeypatch):
     write(tmp_path / "one/i.yaml", TOWER)
     write(tmp_path / "two/i.yaml", OTHER)
+    write(tmp_path / "inside/i.yaml", NESTED)
+    write(tmp_path / "outside/i.yaml", NESTED)
     for name, values in VARIABLES.items():
         write(tmp_path / name, values)
     monkeypatch.chdir(tmp_path)
@@ -136,6 +155,21 @@ def _without_circles(inventory):
         if group and "children" in group:
             del group["children"]
     return inventory
+
+
+def test_devices_files_are_found_from_the_source_whose_list_counts(place):
+    for folder, group in (("inside", "inner"), ("outside", "above"), ("outside", "all")):
+        write(place / folder / f"group_vars/{group}.yml", {"cosmos_devices": [folder]})
+
+    folders = {
+        tuple(sources): read_inventory(sources).machines[0].devices_folder
+        for sources in (["inside", "outside"], ["outside", "inside"])
+    }
+
+    assert folders == {
+        ("inside", "outside"): place / "outside",
+        ("outside", "inside"): place / "inside",
+    }
 
 
 def test_nothing_of_the_first_inventory_is_dropped(place, capsys):

@@ -43,7 +43,7 @@ def do(line="", **options):
     done = up(connection_to(place / "cosmos"), machine(line), kit, **options)
     assert done.failure is None, done.failure
     lines = plan_lines([done], has_diffs="is_check" in options)
-    text = kept.read_text().splitlines()[1:] if kept.exists() else None
+    text = kept.read_text().splitlines()[2:] if kept.exists() else None
     return [line for line in lines if "swappiness" in line], value.read_text().strip(), text
 
 try:

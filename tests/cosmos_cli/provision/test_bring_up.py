@@ -399,7 +399,10 @@ def test_settings_are_made_on_a_system_and_put_back(place):
     assert (place / "system/proc/sys/net/core/rmem_max").read_text() == "8388608\n"
     assert (place / "system/sys/class/rfkill/rfkill0/soft").read_text() == "1\n"
     limits = (place / "system/etc/security/limits.d/90-cosmos.conf").read_text()
-    assert limits.splitlines()[1] == f"{made.facts.user} - rtprio 50"
+    assert limits.splitlines()[1:] == [
+        f"# for {made.facts.user} {place}/cosmos",
+        f"{made.facts.user} - rtprio 50",
+    ]
 
     put_back = up(connection, machine_at(place), kit)
 

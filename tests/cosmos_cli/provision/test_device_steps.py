@@ -1,10 +1,12 @@
 """What devices need of a machine, planned: packages, groups, boot configuration, Python packages."""
 
 import dataclasses
+import shlex
 
 import pytest
 from provision_machines import facts_of, wanted
 
+from cosmos_cli.commands.command_group import load_command
 from cosmos_cli.models.device_needs import DeviceNeeds, MachineNeeds
 from cosmos_cli.models.inventory import Variables
 from cosmos_cli.models.machine_facts import SystemPaths, condition_key
@@ -13,6 +15,7 @@ from cosmos_cli.provision.device_steps import membership, reboot_notes
 from cosmos_cli.provision.step import Done
 from cosmos_cli.provision.steps import notes_of, plan_steps
 from cosmos_cli.provision.wheelhouse import EnvironmentNeed
+from cosmos_cli.ui import invocation
 from madns_runtime.hardware.contract import Needs
 
 CONFIG = "/boot/firmware/config.txt"
@@ -129,13 +132,17 @@ def test_machines_are_asked_what_the_plan_needs():
 
 
 def test_a_changed_boot_configuration_counts_after_a_restart():
+    words = ("-i", "my tower.yaml", "--limit", "tower:!pi01", "s.yaml")
+    invocation.record("up", words, frozenset({"-i", "--limit"}), has_tail=False)
     facts = facts_of(files=config(""), conditions=members(i2c=True))
     (step,) = plan_steps(facts, desired(BUS))
 
-    (note,) = reboot_notes([Done(step=step, changed=True)], SystemPaths(), "pi01")
+    (note,) = reboot_notes([Done(step=step, changed=True)], SystemPaths())
 
-    assert "cosmos reboot --limit pi01" in note
-    assert list(reboot_notes([Done(step=step, changed=False)], SystemPaths(), "pi01")) == []
+    _, verb, *advised = shlex.split(note.split("`")[1])
+    read = load_command(verb).make_context(verb, advised).params
+    assert (verb, read["inventory"], read["limit"]) == ("reboot", ("my tower.yaml",), "tower:!pi01")
+    assert list(reboot_notes([Done(step=step, changed=False)], SystemPaths())) == []
 
 
 def test_the_environment_has_the_requirements_and_sees_the_system_where_it_must():

@@ -35,6 +35,7 @@ class Machine:
 
     def __init__(self, files=None):
         self.files = dict(files or {})
+        self.user, self.home, self.memory_path = "pi", "/home/pi", MEMORY
         self.values = {
             BUFFER: "212992",
             GOVERNOR.format(0): "ondemand",
@@ -47,6 +48,7 @@ class Machine:
         facts = facts_of()
         return dataclasses.replace(
             facts,
+            user=self.user,
             governors={f"cpu{i}": self.values[GOVERNOR.format(i)] for i in (0, 1)},
             radios=tuple(
                 Radio(
@@ -63,7 +65,16 @@ class Machine:
         )
 
     def plan(self, **variables):
-        return list(setting_steps(self.facts(), wanted(variables=variables)))
+        return list(setting_steps(self.facts(), wanted(self.home, variables=variables)))
+
+    @contextlib.contextmanager
+    def login(self, user, home):
+        """Be another user, or have another folder of COSMoS, for a while."""
+        before = self.user, self.home, self.memory_path
+        self.user, self.home = user, home
+        self.memory_path = f"{home}/cosmos/state/settings.json"
+        yield
+        self.user, self.home, self.memory_path = before
 
     def up(self, cut_at=None, **variables):
         """Carry the plan out, and return how many requests that were."""
@@ -78,7 +89,7 @@ class Machine:
         arguments = request.arguments
         match request.verb:
             case "write_file":
-                assert request.as_root == (arguments["path"] != MEMORY)
+                assert request.as_root == (arguments["path"] != self.memory_path)
                 self.files[arguments["path"]] = request.body.decode(errors="surrogateescape")
             case "remove_file":
                 assert request.as_root
@@ -107,7 +118,10 @@ def test_settings_are_made_once():
     assert machine.values[BUFFER] == "8388608"
     assert machine.values[WLAN] == "1"
     assert machine.values[GOVERNOR.format(1)] == "performance"
-    assert machine.files[SYSCTL].splitlines()[1:] == ["net.core.rmem_max = 8388608"]
+    assert machine.files[SYSCTL].splitlines()[1:] == [
+        "# for pi /home/pi/cosmos",
+        "net.core.rmem_max = 8388608",
+    ]
     assert "pi - rtprio 50\n" in machine.files["/etc/security/limits.d/90-cosmos.conf"]
     assert machine.plan(**ALL) == []
 
@@ -127,7 +141,7 @@ def test_logins_of_one_machine_share_the_file_of_priorities():
         memories[user] = (
             {MEMORY: machine.files.pop(MEMORY)} if MEMORY in machine.files else memories[user]
         )
-        lines = machine.files.get(limits, "").splitlines()[1:]
+        lines = [e for e in machine.files.get(limits, "").splitlines() if e[0] != "#"]
         return len(steps), lines
 
     both = ["anna - rtprio 20", "pi - rtprio 50"]
@@ -213,6 +227,76 @@ def test_lost_memory_leaves_no_file_of_ours_behind():
 
     assert machine.files == {}
     assert machine.plan() == []
+
+
+OTHERS = [("anna", "/home/anna"), ("pi", "/srv/second"), ("anna", "/home/pi")]
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_settings_of_another_user_or_folder_are_not_taken_away(other):
+    machine = Machine()
+    machine.up(**ALL)
+    memory = machine.files.pop(MEMORY)
+
+    with machine.login(*other):
+        asks_for_nothing, asks_for_the_same = machine.plan(), machine.plan(**ALL)
+
+    assert asks_for_nothing == []
+    assert [step.title for step in asks_for_the_same] == (
+        [] if other[0] == "pi" else ["setting cosmos_realtime_priority: set otherwise -> 50"]
+    )
+    machine.files[MEMORY] = memory
+    assert machine.plan(**ALL) == []
+
+
+def test_two_folders_put_a_setting_back_one_after_the_other():
+    machine = Machine()
+    before = machine.state
+    machine.up(cosmos_receive_buffer_bytes=1_000_000)
+    first = machine.state
+    with machine.login("anna", "/home/anna"):
+        machine.up(cosmos_receive_buffer_bytes=2_000_000)
+        machine.up()
+        del machine.files[machine.memory_path]
+
+    assert machine.state == first
+    machine.up()
+    assert machine.state == before
+
+
+def test_setting_that_another_has_changed_since_is_left_to_that_one():
+    machine = Machine()
+    machine.up(cosmos_receive_buffer_bytes=1_000_000)
+    with machine.login("anna", "/home/anna"):
+        machine.up(cosmos_receive_buffer_bytes=2_000_000)
+        del machine.files[machine.memory_path]
+    before = machine.state
+
+    (step,) = machine.plan()
+    machine.up()
+
+    assert step.title == "setting cosmos_receive_buffer_bytes: leave to anna /home/anna/cosmos"
+    assert not step.needs_root
+    assert (machine.state, machine.memory) == (before, {})
+    assert machine.plan() == []
+
+
+def test_file_of_an_older_version_is_claimed_once_and_taken_away_without_memory():
+    machine = Machine()
+    machine.up(**ALL)
+    claimed = dict(machine.files)
+    for path, text in machine.files.items():
+        kept = [line for line in text.splitlines(keepends=True) if not line.startswith("# for")]
+        machine.files[path] = "".join(kept)
+    memory = machine.files.pop(MEMORY)
+    assert machine.plan(**ALL) == []
+    machine.files[MEMORY] = memory
+
+    assert len(machine.plan(**ALL)) == len(ALL)
+    machine.up(**ALL)
+
+    assert machine.files == claimed
+    assert machine.plan(**ALL) == []
 
 
 @pytest.mark.parametrize("cut_at", range(30))
