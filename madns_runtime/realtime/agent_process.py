@@ -169,6 +169,8 @@ class AgentProcess:
         self._away.discard(seat.name)
         self._process.awaited -= 1
         self._incarnations[seat.name] += 1
+        # Of its earlier start's devices it knows nothing: no status, and nothing that found no room there.
+        seat = replace(seat, hardware=self._supervisor.hardware_of(seat.name))
         try:
             self._runners[seat.name] = runner = self._make_runner(seat)
         except MadnsError as error:  # the others of the process go on; the host misses it

@@ -102,6 +102,15 @@ def test_an_agent_that_returns_to_its_process_moves_its_device_again(shared):
     assert document["devices"]["agent-03/valve"]["restarts"] == 0
 
 
+def test_an_agent_that_returns_to_its_process_is_told_its_devices_status(shared):
+    _, folder = shared
+
+    for name in ("events", "events.2"):
+        events = rows(folder / f"agents/agent-03/{name}.jsonl")
+        told = [event["status"] for event in events if event.get("event") == "device"]
+        assert told[:1] == ["ok"]
+
+
 def test_outputs_of_an_agent_that_goes_on_are_left_alone(shared):
     document, folder = shared
 

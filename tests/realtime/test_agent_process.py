@@ -25,10 +25,11 @@ SUPERVISOR = SupervisorCalls(
 
 
 def test_an_agent_that_returns_is_given_what_its_conditions_had_counted(monkeypatch):
-    given = []
+    given, devices = [], []
 
     def make(seat, launch, program, **more):
         given.append((program.incarnation, more["counted"]))
+        devices.append(seat.hardware)
         return SimpleNamespace(
             counted=lambda: {3: 10 * program.incarnation},
             start=lambda: None,
