@@ -13,6 +13,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Channel, Value
 from madns_runtime.hardware.count_table import missed_name
+from madns_runtime.hardware.fault_orders import ORDERS_FROM
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import pack_points, packs_max
 from madns_runtime.hardware.status import StatusLimits
@@ -32,8 +33,6 @@ PACKS_MAX: Final = 64
 beyond, and their points counted."""
 ANSWERS_MAX: Final = 8
 """Orders whose answers are told; who gave an older one has stopped waiting."""
-ORDERS_FROM: Final = 1_000_000
-"""Numbers of orders from here on are a timeline's: nobody waits for an answer."""
 TOLD_BYTES_MAX: Final = 200
 """Of one sentence in a report, which goes into a datagram ..."""
 ANSWERS_BYTES_MAX: Final = 450

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from time import monotonic
 from typing import Any
 
+from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, schema_of
 from madns_runtime.recording.run_journal import RunJournal
@@ -107,12 +108,17 @@ class DeviceRecords:
 
     def state(
         self, now_s: float, counts: tuple[int, int], late_us_max: int, details: Mapping[str, Any]
-    ) -> None:
-        """Record samples and errors so far, and what the driver tells."""
-        if self.time.is_known:
-            t_s = round(self.time.at(now_s), 6)
-            values = (t_s, *counts, late_us_max, dict(details) or None)
-            self._recorder.record(DEVICE_STATE.name, values)
+    ) -> str:
+        """Record samples and errors so far, and what the driver tells; return why not the latter, if JSON cannot carry it, else ""."""
+        if not self.time.is_known:
+            return ""
+        numbers = (round(self.time.at(now_s), 6), *counts, late_us_max)
+        try:
+            self._recorder.record(DEVICE_STATE.name, (*numbers, dict(details) or None))
+        except PluginError as error:
+            self._recorder.record(DEVICE_STATE.name, (*numbers, None))
+            return str(error)
+        return ""
 
     def event(self, event: str, now_s: float, **values: Any) -> None:
         """Record that something befell the device; t_s is null before simulated time."""
