@@ -229,9 +229,9 @@ class DevicePort:
                 return
             del self._unsent[channel]
 
-    def tell_time(self, local_s: float, t_s: float, rate: float) -> None:
-        """Tell the device's process what simulated time it is; the framework calls it now and then."""
-        self._page.time.write(local_s, t_s, rate)
+    def tell_time(self, local_s: float, t_s: float, rate: float, end_s: float = math.inf) -> None:
+        """Tell the device's process what simulated time it is, and when that ends; the framework calls it now and then."""
+        self._page.time.write(local_s, t_s, rate, end_s)
         messages.send(self._end, [messages.TIME])
 
     @property
@@ -376,10 +376,10 @@ class Hardware(Mapping[str, DevicePort]):
         """Return the devices with which something found no room, by full name, and counts of what; see `DevicePort.losses`."""
         return {port.full_name: lost for port in self._ports.values() if (lost := port.losses())}
 
-    def tell_time(self, local_s: float, t_s: float, rate: float) -> None:
-        """Tell all devices what simulated time it is."""
+    def tell_time(self, local_s: float, t_s: float, rate: float, end_s: float = math.inf) -> None:
+        """Tell all devices what simulated time it is, and when that ends."""
         for port in self._ports.values():
-            port.tell_time(local_s, t_s, rate)
+            port.tell_time(local_s, t_s, rate, end_s)
 
 
 def _cut(text: str) -> str:

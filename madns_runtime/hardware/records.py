@@ -20,6 +20,8 @@ class SimulatedTime:
     def __init__(self) -> None:
         self._local_s = self._t_s = math.nan
         self._rate = 1.0
+        self.end_s = math.inf
+        """When it ends, as far as is known, simulated, s."""
 
     @property
     def is_known(self) -> bool:
@@ -69,11 +71,12 @@ class DeviceRecords:
         self._recorder.open_stream(DEVICE_STATE)
         self._recorder.open_stream(DEVICE_CLOCK)
 
-    def set_time(self, local_s: float, t_s: float, rate: float) -> None:
-        """Take note of simulated time, see `SimulatedTime.set`."""
+    def set_time(self, local_s: float, t_s: float, rate: float, end_s: float = math.inf) -> None:
+        """Take note of simulated time, see `SimulatedTime.set`, and of its end."""
         if not self.time.is_known:
             self._recorder.set_t0(utc_at_iso(-t_s))
         self.time.set(local_s, t_s, rate)
+        self.time.end_s = end_s
         early, self._early = self._early, {}
         for channel, (number, taken_s, values, told_s) in early.items():
             self.sample(channel, number, taken_s, values, told_s=told_s)

@@ -293,21 +293,22 @@ class DeviceRunner:
         self._schedule_write()
 
     def _schedule_write(self) -> None:
-        """Have what is due next put out; without the time of the run no point is."""
-        point_s = self._records.time.local_s(self._outputs.next_point_s())
-        due_s = min(self._outputs.next_write_s(), math.inf if math.isnan(point_s) else point_s)
-        self._write_timer.reschedule(max(due_s, 0.0))
+        """Have what is due next put out; without the time of the run no point is, nor anything behind its end."""
+        time = self._records.time
+        self._write_timer.reschedule(max(0.0, self._outputs.next_s(time.local_s, time.end_s)))
 
     def _write_due(self) -> None:
-        now_s = monotonic()
-        time = self._records.time
-        for output in self._outputs.due(now_s, time.at(now_s), time.local_s):
+        now_s, time = monotonic(), self._records.time
+        t_s, before_end_s = time.at(now_s), math.nextafter(time.end_s, -math.inf)
+        for output in self._outputs.due(now_s, min(t_s, before_end_s), time.local_s):
             if output.point is not None and output.point.is_underrun:
                 self._intake.event("underrun", monotonic(), channel=output.channel.name)
             if self._device is None:
                 self._outputs.note_lost(output)  # what is due meanwhile is not put out late
             elif output.value is not None and not self._put_out(self._device, output):
                 break
+        if t_s >= time.end_s:
+            self._intake.count("writes_left", self._outputs.clear())
         self._schedule_write()
 
     def _put_out(self, device: Device, output: DueOutput) -> bool:

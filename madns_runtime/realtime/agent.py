@@ -105,8 +105,6 @@ class AgentRunner:
         self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
         self._records = ProcessRecords(self._journal, self._config.health.period_s)
         self._hardware = seat.hardware
-        self._hardware.use_clock(self._port.local_s)
-        self._device_time = DeviceTime(seat.hardware, self._port)
         self.half = half = Half(program.make, self._journal.say)
         """The plug-in's part."""
         self._receive = half.simulation.receive  # called often: without a layer between
@@ -114,6 +112,7 @@ class AgentRunner:
         self._pack = pack
         self._ticks = ticks = self._make_ticks(seat, recorder)
         pack.add(ticks)
+        self._device_time = DeviceTime(seat.hardware, self._port, lambda: ticks.duration_s)
         self._actions = OrderedActions(
             seat,
             program.actions,
@@ -284,6 +283,7 @@ class AgentRunner:
         self._usage_timer.reschedule(self._records.usage_due_s + self._session.ping_slack_s)
 
     def _ticks_over(self) -> None:
+        self._device_time.follow()  # where a stop has made the end sooner
         self._last_answers.begin(self._port.local_s(self._ticks.over_s()))
 
     def _step_failed(self, error: BaseException) -> None:
