@@ -65,7 +65,7 @@ class DeviceRecords:
             each.name for each in channels if each.passing == "newest" and not each.is_frame
         }
         self._early: dict[str, tuple[int, float, Sequence[Any], float]] = {}
-        """Of these inputs the newest values from before simulated time is known: agents find them in their first ticks."""
+        """Of these inputs the newest values handed on before simulated time 0: agents find them in their first ticks."""
         for channel in channels:
             self._recorder.open_stream(schema_of(channel))
         self._recorder.open_stream(DEVICE_STATE)
@@ -77,9 +77,6 @@ class DeviceRecords:
             self._recorder.set_t0(utc_at_iso(-t_s))
         self.time.set(local_s, t_s, rate)
         self.time.end_s = end_s
-        early, self._early = self._early, {}
-        for channel, (number, taken_s, values, told_s) in early.items():
-            self.sample(channel, number, taken_s, values, told_s=told_s)
 
     def sample(
         self, channel: str, number: int, taken_s: float, values: Sequence[Any], *, told_s: float
@@ -87,12 +84,23 @@ class DeviceRecords:
         """
         Record values of an input, taken at *taken_s* and handed on at *told_s*.
 
-        Before simulated time is known nothing is, but for the newest values then, by which agents' first ticks act.
+        Of those handed on before simulated time 0 only the newest are, by which agents' first ticks act, and what comes through
+        queues once simulated time is known.
         """
-        if not self.time.is_known:
+        if not self.time.is_known or (channel in self._newest and self.time.at(told_s) < 0.0):
             if channel in self._newest and all(map(math.isfinite, values)):
                 self._early[channel] = (number, taken_s, values, told_s)
             return
+        if channel in self._early:
+            self._record_early(channel)
+        self._record(channel, number, taken_s, values, told_s)
+
+    def _record_early(self, channel: str) -> None:
+        self._record(channel, *self._early.pop(channel))
+
+    def _record(
+        self, channel: str, number: int, taken_s: float, values: Sequence[Any], told_s: float
+    ) -> None:
         t_s = round(self.time.at(taken_s), 6)
         age_us = round((told_s - taken_s) * 1e6)
         self._recorder.record(channel, (t_s, number, age_us, *values))
@@ -130,4 +138,6 @@ class DeviceRecords:
 
     def close(self, timeout_s: float) -> Mapping[str, Any]:
         """Close the streams, and return the counts of their records."""
+        for channel in list(self._early) if self.time.is_known else ():
+            self._record_early(channel)  # no other has come since
         return self.journal.close(timeout_s).to_mapping()
