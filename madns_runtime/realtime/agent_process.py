@@ -35,7 +35,7 @@ HANG_GRACE_S = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SupervisorCalls:
-    """What a process of agents is given by its supervisor, to call in the child."""
+    """Calls that a supervisor hands to a process of agents, for the child."""
 
     hardware_of: Callable[[str], Hardware]
     """Returns the devices that an agent uses, as one that starts sees them."""
