@@ -180,7 +180,9 @@ class _Plan:
         if claim is None:
             return False
         is_known = setting.key in self.memory  # a user whose name changed has the same memory
-        return claim.split()[-1] != root or not (is_known or claim == f"{self.facts.user} {root}")
+        return claim.partition(" ")[2] != root or not (
+            is_known or claim == f"{self.facts.user} {root}"
+        )
 
     def _is_said(self, setting: Setting, found: str | None, text: str) -> bool:
         """

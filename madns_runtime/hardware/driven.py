@@ -19,6 +19,7 @@ from madns_runtime.hardware.intake import counts_of, silent_inputs
 from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.status import StatusAccount, StatusLimits, limits_of, sample_period_s
 from madns_runtime.reactor.descriptors import allow_descriptors, ready
@@ -81,6 +82,16 @@ class DrivenDevice:
         """Whether it has outputs that may move."""
         is_out = (channel.direction == "out" for channel in self.seat.channels)
         return self.seat.launch.may_move and any(is_out)
+
+    def port_of(self, agent: str) -> DevicePort:
+        """Return it as an agent that uses it sees it; called in the agent's process."""
+        return DevicePort(
+            self.name,
+            self.seat.channels,
+            shared=(self.seat.page, self.ends[agent]),
+            limits=self.limits,
+            agent=agent,
+        )
 
     def alter(self, alter: Callable[[Device], None]) -> None:
         """Have each driver of it altered when it is made."""
@@ -175,6 +186,10 @@ class DeviceProcess:
     killed_why: str = ""
     gave_up_why: str = ""
     """Its own words before its end."""
+
+    def tell(self, message: list[Any]) -> bool:
+        """Send it a message; False if it does not listen."""
+        return self.control is not None and messages.send(self.control, message)
 
     def has_words(self) -> bool:
         """Tell whether it has said something that nobody has heard, or has closed its end."""

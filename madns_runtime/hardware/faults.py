@@ -93,10 +93,9 @@ class InsertedFaults:
         return None
 
     def due(self, now_s: float) -> list[Sample]:
-        """Return the delayed samples whose time has come by *now_s*."""
-        delay_s = self._values.get("delay", 0.0)
+        """Return the delayed samples whose time has come by *now_s*; of a device that is disconnected none."""
         found = []
-        while self._held and later_s(self._held[0].taken_s, delay_s) <= now_s:
+        while self.next_due_s() <= now_s:
             found.append(self._held.popleft())
         return found
 
@@ -107,8 +106,8 @@ class InsertedFaults:
         return count
 
     def next_due_s(self) -> float:
-        """Return when the next delayed sample is due; infinity if none waits."""
-        if not self._held:
+        """Return when the next delayed sample is due; infinity if none waits, or the device is disconnected."""
+        if not self._held or self.is_disconnected:
             return math.inf
         return later_s(self._held[0].taken_s, self._values.get("delay", 0.0))
 

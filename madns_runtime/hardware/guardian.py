@@ -2,7 +2,8 @@
 Makes a machine's outputs safe when the process that drives them is gone, or does not do it itself.
 
 One process per machine, and only where outputs may move. It watches the devices' processes, the agents that own
-outputs, and the supervisor, each through a descriptor that tells the kernel's word of its end. When one of them
+outputs, and the supervisor, each through a descriptor that tells the kernel's word of its end; of an agent that
+ends while others of its process go on, the supervisor tells it. When one of them
 ends, a device's process has GRACE_S to say in the page that all is safe; then it is killed, and a process of the
 guardian's opens the device anew for `make_safe` alone. That process stands by from the run's first seconds on: to
 import a driver's libraries takes a small board longer than outputs may wait.
@@ -38,8 +39,9 @@ STAND_BY_S: Final = 1.0
 """Time from a device's start until a process stands by for it: the start of a run has the processors to itself."""
 LINGER_S: Final = 20.0
 """Time after the supervisor's end: by then every attempt is over."""
-WATCH, DRIVES, OVER, SAFE = "watch", "drives", "over", "safe"
-"""Words: [WATCH, agent, pid], [DRIVES, device, pid] and [OVER] to the guardian, [SAFE, device, how] from it."""
+WATCH, DRIVES, LEFT, OVER, SAFE = "watch", "drives", "left", "over", "safe"
+"""Words: [WATCH, agent, pid], [DRIVES, device, pid], [LEFT, agent] of one that ends in a process which others keep, and
+[OVER] to the guardian, [SAFE, device, how] from it."""
 
 
 def guard_outputs(seats: Mapping[str, DeviceSeat], control: socket.socket) -> None:
@@ -98,6 +100,9 @@ class Guardian:
             has_heard = True
             if word == OVER:
                 self._expect_all_safe()  # also where a driver does not return
+                continue
+            if word == LEFT:
+                self._owner_ended(str(rest[0]))
                 continue
             name, pid = str(rest[0]), int(rest[1])
             if word == DRIVES:

@@ -32,7 +32,7 @@ from madns_runtime.hardware.driven import (
 from madns_runtime.hardware.guardian import guard_outputs
 from madns_runtime.hardware.kind_registry import prepare
 from madns_runtime.hardware.page import DevicePage
-from madns_runtime.hardware.port import DevicePort, Hardware
+from madns_runtime.hardware.port import Hardware
 from madns_runtime.hardware.status import back_off_s
 from madns_runtime.plugin.context import clean_text
 from madns_runtime.reactor.reactor import Reactor
@@ -120,19 +120,8 @@ class DeviceManager:
 
     def hardware_of(self, agent: str) -> Hardware:
         """Return the devices that an agent uses; called in its process."""
-        return Hardware(
-            {
-                driven.seat.launch.name: DevicePort(
-                    driven.name,
-                    driven.seat.channels,
-                    shared=(driven.seat.page, driven.ends[agent]),
-                    limits=driven.limits,
-                    agent=agent,
-                )
-                for driven in self._devices.values()
-                if agent in driven.ends
-            }
-        )
+        users = (driven for driven in self._devices.values() if agent in driven.ends)
+        return Hardware({driven.seat.launch.name: driven.port_of(agent) for driven in users})
 
     def alter(self, device: str, alter: Callable[[Device], None]) -> None:
         """Have each driver of a device altered when it is made, as a verification does; before `start`."""
@@ -159,21 +148,27 @@ class DeviceManager:
 
     def agents_started(self, agents: Sequence[str], pid: int) -> None:
         """Take note of the process that agents run in: if it ends, what they own is made safe."""
-        if self._guardian is None:
-            return
-        for driven in self._devices.values():
-            if driven.name in self._guarded and driven.seat.launch.owner in agents:
-                self._owners[driven.seat.launch.owner] = pid
-                messages.send(self._guardian, [guardian.WATCH, driven.seat.launch.owner, pid])
+        for owner in sorted({seat.launch.owner for seat in self._guarded.values()}):
+            if owner in agents:
+                self._owners[owner] = pid
+                self._tell_guardian(guardian.WATCH, owner, pid)
 
     def agents_ended(self, agents: Sequence[str]) -> None:
-        """Have what they own made safe."""
+        """Have what they own made safe: their process has ended."""
         for agent in agents:
             self._owners.pop(agent, None)
+        self._tell_owner_gone(agents)
+
+    def agent_left(self, agent: str) -> None:
+        """Have what an agent owns made safe: it has ended, while its process goes on, in which it may return."""
+        self._tell_guardian(guardian.LEFT, agent)
+        self._tell_owner_gone((agent,))
+
+    def _tell_owner_gone(self, agents: Sequence[str]) -> None:
         for process in self._processes:
             for driven in process.devices:
-                if driven.seat.launch.owner in agents and process.control is not None:
-                    messages.send(process.control, [messages.OWNER_GONE, driven.name])
+                if driven.seat.launch.owner in agents:
+                    process.tell([messages.OWNER_GONE, driven.name])
 
     def insert_fault(self, target: str, action: str, value: float | None) -> str | None:
         """Put a fault in force around a device by its full name; return why it cannot be, or None."""
@@ -183,8 +178,7 @@ class DeviceManager:
                     continue
                 if refusal := driven.refusal_of(action):
                     return refusal
-                message = [messages.FAULT, target, action, value]
-                if process.control is not None and messages.send(process.control, message):
+                if process.tell([messages.FAULT, target, action, value]):
                     driven.note_fault(action, value)
                     return None
                 return f"{target}: its process does not listen"
@@ -197,11 +191,15 @@ class DeviceManager:
         for process in self._processes:
             for driven in process.devices:
                 if process.pid and driven.name in self._guarded:
-                    messages.send(self._guardian, [guardian.DRIVES, driven.name, process.pid])
+                    self._tell_guardian(guardian.DRIVES, driven.name, process.pid)
         for owner, pid in self._owners.items():
-            messages.send(self._guardian, [guardian.WATCH, owner, pid])
+            self._tell_guardian(guardian.WATCH, owner, pid)
         if self._reactor is not None:
             self._reactor.add_reader(self._guardian.fileno(), self._hear_guardian)
+
+    def _tell_guardian(self, *message: str | int) -> None:
+        if self._guardian is not None:
+            messages.send(self._guardian, list(message))
 
     def _start(self, process: DeviceProcess) -> None:
         config, directory = self._launch.config, Path(self._launch.directory)
@@ -214,11 +212,11 @@ class DeviceManager:
             lambda control: run_devices(seats, control, config, directory)
         )
         for driven in process.devices:
-            if self._guardian is not None and driven.name in self._guarded:
-                messages.send(self._guardian, [guardian.DRIVES, driven.name, process.pid])
+            if driven.name in self._guarded:
+                self._tell_guardian(guardian.DRIVES, driven.name, process.pid)
             driven.seat.page.header[page.PID] = float(process.pid)
             for action, value in driven.faults.items():
-                messages.send(process.control, [messages.FAULT, driven.name, action, value])
+                process.tell([messages.FAULT, driven.name, action, value])
         self._listen(process)
 
     def _listen(self, process: DeviceProcess) -> None:
@@ -368,10 +366,8 @@ class DeviceManager:
         for driven in self._devices.values():
             driven.account.observe(driven.account.status, monotonic())
         for process in self._processes:
-            if process.control is not None:
-                messages.send(process.control, [messages.END, why])
-        if self._guardian is not None:
-            messages.send(self._guardian, [guardian.OVER])
+            process.tell([messages.END, why])
+        self._tell_guardian(guardian.OVER)
 
     def close(self) -> Mapping[str, Any]:
         """End what still runs, and return what became of each device, by its full name."""

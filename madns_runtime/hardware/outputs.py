@@ -170,6 +170,21 @@ class DeviceOutputs:
                 due_s = local_s(point.t_s)
                 yield DueOutput(channel=channel, value=value, due_s=due_s, point=point)
 
+    def next_s(self, local_s: Callable[[float], float], end_s: float) -> float:
+        """
+        Return when something is to be done next on the clock of whoever drives the device, s; infinity if nothing waits.
+
+        What waits at the run's end is to be forgotten then.
+
+        Args:
+            local_s: Returns when a simulated time is on that clock, s; not a number before that is known.
+            end_s: The run's end, simulated, s.
+        """
+        point_s = local_s(self.next_point_s())
+        due_s = min(self.next_write_s(), math.inf if math.isnan(point_s) else point_s)
+        ended_s = math.inf if math.isinf(due_s) else local_s(end_s)
+        return due_s if math.isnan(ended_s) else min(due_s, ended_s)
+
     def next_write_s(self) -> float:
         """Return when a write is due next, s; infinity if none waits."""
         return self._pending.next_due_s()

@@ -37,7 +37,7 @@ so far, process id, how often its outputs were made safe, when its newest sample
 1 if outputs have moved since they were last made safe, how often the device was lost, and 1 while the guardian makes
 outputs safe that have moved: nobody knows yet."""
 HEADER_BYTES: Final = 128
-TIME_NUMBERS: Final = 3
+TIME_NUMBERS: Final = 4
 
 
 class SlotReading(NamedTuple):
@@ -166,20 +166,20 @@ class _Slot:
 
 class TimeSlot:
     """
-    Simulated time on this machine's clock, as the agents that use a device estimate it: (local_s, t_s, rate).
+    Simulated time on this machine's clock, as the agents that use a device estimate it: (local_s, t_s, rate, end_s).
 
-    Simulated time *t_s* is at *local_s* and runs at *rate* simulated seconds per local one. Whichever agent writes,
+    Simulated time *t_s* is at *local_s*, runs at *rate* simulated seconds per local one, and ends at *end_s*. Whichever agent writes,
     they agree within the uncertainty of their clocks; a mix of two does not pass the checksum.
     """
 
     def __init__(self, view: memoryview, start: int) -> None:
         self._slot = _Slot(view, start, TIME_NUMBERS)
 
-    def write(self, local_s: float, t_s: float, rate: float) -> None:
+    def write(self, local_s: float, t_s: float, rate: float, end_s: float) -> None:
         """Take note of the time."""
-        self._slot.write(local_s, math.nan, (local_s, t_s, rate))
+        self._slot.write(local_s, math.nan, (local_s, t_s, rate, end_s))
 
-    def read(self) -> tuple[float, float, float] | None:
+    def read(self) -> tuple[float, float, float, float] | None:
         """Return the newest note; None before simulated time runs."""
-        number, _, _, (local_s, t_s, rate) = self._slot.read()
-        return (local_s, t_s, rate) if number else None
+        number, _, _, (local_s, t_s, rate, end_s) = self._slot.read()
+        return (local_s, t_s, rate, end_s) if number else None

@@ -13,6 +13,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Channel, Value
 from madns_runtime.hardware.count_table import missed_name
+from madns_runtime.hardware.fault_orders import ORDERS_FROM
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import pack_points, packs_max
 from madns_runtime.hardware.status import StatusLimits
@@ -32,8 +33,6 @@ PACKS_MAX: Final = 64
 beyond, and their points counted."""
 ANSWERS_MAX: Final = 8
 """Orders whose answers are told; who gave an older one has stopped waiting."""
-ORDERS_FROM: Final = 1_000_000
-"""Numbers of orders from here on are a timeline's: nobody waits for an answer."""
 TOLD_BYTES_MAX: Final = 200
 """Of one sentence in a report, which goes into a datagram ..."""
 ANSWERS_BYTES_MAX: Final = 450
@@ -230,9 +229,9 @@ class DevicePort:
                 return
             del self._unsent[channel]
 
-    def tell_time(self, local_s: float, t_s: float, rate: float) -> None:
-        """Tell the device's process what simulated time it is; the framework calls it now and then."""
-        self._page.time.write(local_s, t_s, rate)
+    def tell_time(self, local_s: float, t_s: float, rate: float, end_s: float = math.inf) -> None:
+        """Tell the device's process what simulated time it is, and when that ends; the framework calls it now and then."""
+        self._page.time.write(local_s, t_s, rate, end_s)
         messages.send(self._end, [messages.TIME])
 
     @property
@@ -377,10 +376,10 @@ class Hardware(Mapping[str, DevicePort]):
         """Return the devices with which something found no room, by full name, and counts of what; see `DevicePort.losses`."""
         return {port.full_name: lost for port in self._ports.values() if (lost := port.losses())}
 
-    def tell_time(self, local_s: float, t_s: float, rate: float) -> None:
-        """Tell all devices what simulated time it is."""
+    def tell_time(self, local_s: float, t_s: float, rate: float, end_s: float = math.inf) -> None:
+        """Tell all devices what simulated time it is, and when that ends."""
         for port in self._ports.values():
-            port.tell_time(local_s, t_s, rate)
+            port.tell_time(local_s, t_s, rate, end_s)
 
 
 def _cut(text: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from time import monotonic
 from typing import Any
 
+from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, schema_of
 from madns_runtime.recording.run_journal import RunJournal
@@ -19,6 +20,8 @@ class SimulatedTime:
     def __init__(self) -> None:
         self._local_s = self._t_s = math.nan
         self._rate = 1.0
+        self.end_s = math.inf
+        """When it ends, as far as is known, simulated, s."""
 
     @property
     def is_known(self) -> bool:
@@ -62,20 +65,18 @@ class DeviceRecords:
             each.name for each in channels if each.passing == "newest" and not each.is_frame
         }
         self._early: dict[str, tuple[int, float, Sequence[Any], float]] = {}
-        """Of these inputs the newest values from before simulated time is known: agents find them in their first ticks."""
+        """Of these inputs the newest values handed on before simulated time 0: agents find them in their first ticks."""
         for channel in channels:
             self._recorder.open_stream(schema_of(channel))
         self._recorder.open_stream(DEVICE_STATE)
         self._recorder.open_stream(DEVICE_CLOCK)
 
-    def set_time(self, local_s: float, t_s: float, rate: float) -> None:
-        """Take note of simulated time, see `SimulatedTime.set`."""
+    def set_time(self, local_s: float, t_s: float, rate: float, end_s: float = math.inf) -> None:
+        """Take note of simulated time, see `SimulatedTime.set`, and of its end."""
         if not self.time.is_known:
             self._recorder.set_t0(utc_at_iso(-t_s))
         self.time.set(local_s, t_s, rate)
-        early, self._early = self._early, {}
-        for channel, (number, taken_s, values, told_s) in early.items():
-            self.sample(channel, number, taken_s, values, told_s=told_s)
+        self.time.end_s = end_s
 
     def sample(
         self, channel: str, number: int, taken_s: float, values: Sequence[Any], *, told_s: float
@@ -83,12 +84,23 @@ class DeviceRecords:
         """
         Record values of an input, taken at *taken_s* and handed on at *told_s*.
 
-        Before simulated time is known nothing is, but for the newest values then, by which agents' first ticks act.
+        Of those handed on before simulated time 0 only the newest are, by which agents' first ticks act, and what comes through
+        queues once simulated time is known.
         """
-        if not self.time.is_known:
+        if not self.time.is_known or (channel in self._newest and self.time.at(told_s) < 0.0):
             if channel in self._newest and all(map(math.isfinite, values)):
                 self._early[channel] = (number, taken_s, values, told_s)
             return
+        if channel in self._early:
+            self._record_early(channel)
+        self._record(channel, number, taken_s, values, told_s)
+
+    def _record_early(self, channel: str) -> None:
+        self._record(channel, *self._early.pop(channel))
+
+    def _record(
+        self, channel: str, number: int, taken_s: float, values: Sequence[Any], told_s: float
+    ) -> None:
         t_s = round(self.time.at(taken_s), 6)
         age_us = round((told_s - taken_s) * 1e6)
         self._recorder.record(channel, (t_s, number, age_us, *values))
@@ -107,12 +119,17 @@ class DeviceRecords:
 
     def state(
         self, now_s: float, counts: tuple[int, int], late_us_max: int, details: Mapping[str, Any]
-    ) -> None:
-        """Record samples and errors so far, and what the driver tells."""
-        if self.time.is_known:
-            t_s = round(self.time.at(now_s), 6)
-            values = (t_s, *counts, late_us_max, dict(details) or None)
-            self._recorder.record(DEVICE_STATE.name, values)
+    ) -> str:
+        """Record samples and errors so far, and what the driver tells; return why not the latter, if JSON cannot carry it, else ""."""
+        if not self.time.is_known:
+            return ""
+        numbers = (round(self.time.at(now_s), 6), *counts, late_us_max)
+        try:
+            self._recorder.record(DEVICE_STATE.name, (*numbers, dict(details) or None))
+        except PluginError as error:
+            self._recorder.record(DEVICE_STATE.name, (*numbers, None))
+            return str(error)
+        return ""
 
     def event(self, event: str, now_s: float, **values: Any) -> None:
         """Record that something befell the device; t_s is null before simulated time."""
@@ -121,4 +138,6 @@ class DeviceRecords:
 
     def close(self, timeout_s: float) -> Mapping[str, Any]:
         """Close the streams, and return the counts of their records."""
+        for channel in list(self._early) if self.time.is_known else ():
+            self._record_early(channel)  # no other has come since
         return self.journal.close(timeout_s).to_mapping()

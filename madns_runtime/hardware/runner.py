@@ -13,6 +13,7 @@ from madns_runtime.errors import MachineError, MadnsError, PluginError
 from madns_runtime.hardware import driver_answers, messages, page
 from madns_runtime.hardware.contract import Device, SimulatedDevice
 from madns_runtime.hardware.descriptor import DriverDescriptor
+from madns_runtime.hardware.fault_orders import CarriedOutEnds
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.outbox import UserOutbox
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
@@ -54,6 +55,7 @@ class DeviceRunner:
             handed_s=lambda taken_up_s: monotonic(),
         )
         self._outputs = DeviceOutputs(launch, seat.channels, self._intake.count)
+        self._ends = CarriedOutEnds()
         self.tell_error: Callable[[str], object] = lambda text: None
         """Told what the driver raised, before the device is closed for it."""
         self.tell_fault: Callable[[str, float | None], object] = lambda action, value: None
@@ -291,21 +293,22 @@ class DeviceRunner:
         self._schedule_write()
 
     def _schedule_write(self) -> None:
-        """Have what is due next put out; without the time of the run no point is."""
-        point_s = self._records.time.local_s(self._outputs.next_point_s())
-        due_s = min(self._outputs.next_write_s(), math.inf if math.isnan(point_s) else point_s)
-        self._write_timer.reschedule(max(due_s, 0.0))
+        """Have what is due next put out; without the time of the run no point is, nor anything behind its end."""
+        time = self._records.time
+        self._write_timer.reschedule(max(0.0, self._outputs.next_s(time.local_s, time.end_s)))
 
     def _write_due(self) -> None:
-        now_s = monotonic()
-        time = self._records.time
-        for output in self._outputs.due(now_s, time.at(now_s), time.local_s):
+        now_s, time = monotonic(), self._records.time
+        t_s, before_end_s = time.at(now_s), math.nextafter(time.end_s, -math.inf)
+        for output in self._outputs.due(now_s, min(t_s, before_end_s), time.local_s):
             if output.point is not None and output.point.is_underrun:
                 self._intake.event("underrun", monotonic(), channel=output.channel.name)
             if self._device is None:
                 self._outputs.note_lost(output)  # what is due meanwhile is not put out late
             elif output.value is not None and not self._put_out(self._device, output):
                 break
+        if t_s >= time.end_s:
+            self._intake.count("writes_left", self._outputs.clear())
         self._schedule_write()
 
     def _put_out(self, device: Device, output: DueOutput) -> bool:
@@ -342,8 +345,9 @@ class DeviceRunner:
     def _take_fault(
         self, end: socket.socket, number: int, action: str, value: float | None
     ) -> None:
-        """Put a fault in force that an agent orders for the host, and answer."""
-        refusal = self.insert_fault(action, value, is_known=False)
+        """Put a fault in force that an agent orders for the host, or end it, once, and answer."""
+        is_repeated = self._ends.is_repeated(number)
+        refusal = "" if is_repeated else self.insert_fault(action, value, is_known=False)
         messages.send(end, [messages.ANSWER, number, refusal])
 
     def insert_fault(self, action: str, value: float | None, *, is_known: bool = True) -> str:
@@ -377,15 +381,11 @@ class DeviceRunner:
             except BaseException as error:  # noqa: BLE001 - a driver may raise anything
                 self._fail("health", error)
         counts = int(self._header[page.SAMPLES]), int(self._header[page.ERRORS])
-        try:
-            self._records.state(now_s, counts, self._late_us_max, details)
-        except PluginError as error:  # details that JSON cannot carry
-            self._refuse(f"health: {error}")
-            self._records.state(now_s, counts, self._late_us_max, {})
+        if refusal := self._records.state(now_s, counts, self._late_us_max, details):
+            self._refuse(f"health: {refusal}")
         self._late_us_max = 0
         self._check_memory()
-        estimate = self._intake.clock.estimate()
-        if estimate is not None:
+        if (estimate := self._intake.clock.estimate()) is not None:
             self._records.clock(now_s, estimate.offset_s, estimate.drift_ppm)
         self._state_timer.reschedule(now_s + STATE_PERIOD_S)
 

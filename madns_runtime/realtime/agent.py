@@ -57,6 +57,7 @@ class AgentRunner:
         process: What it shares with the other agents of its process.
         pack: Whom it ticks with.
         on_ended: Called once, with how it ended.
+        on_left: Called with its name when it has ended early, before its records are closed.
         on_killed: Called when a fault is to end it: with its name, why, and the time until its return, s.
         counted: What conditions have counted in its earlier incarnation in this process.
 
@@ -75,13 +76,15 @@ class AgentRunner:
         process: ProcessPort,
         pack: Pack,
         on_ended: Callable[[str, AgentOutcome], None],
+        on_left: Callable[[str], None],
         on_killed: Callable[[str, str, float | None], None],
         counted: Mapping[int, int],
     ) -> None:
         self.name = name = seat.name
         self._calls, self._number = seat.calls.page, seat.number
         self._config = config = launch.config
-        self._program, self._reactor, self._on_ended = program, reactor, on_ended
+        self._program, self._reactor = program, reactor
+        self._on_ended, self._on_left = on_ended, on_left
         self._port = AgentPort(
             name,
             launch,
@@ -102,9 +105,6 @@ class AgentRunner:
         self._journal = RunJournal(recorder, config.recording.verbosity, t_s=self._port.t_s)
         self._records = ProcessRecords(self._journal, self._config.health.period_s)
         self._hardware = seat.hardware
-        self._hardware.use_clock(self._port.local_s)
-        self._has_devices = bool(seat.hardware)
-        self._device_time = DeviceTime(seat.hardware, self._port)
         self.half = half = Half(program.make, self._journal.say)
         """The plug-in's part."""
         self._receive = half.simulation.receive  # called often: without a layer between
@@ -112,6 +112,7 @@ class AgentRunner:
         self._pack = pack
         self._ticks = ticks = self._make_ticks(seat, recorder)
         pack.add(ticks)
+        self._device_time = DeviceTime(seat.hardware, self._port, lambda: ticks.duration_s)
         self._actions = OrderedActions(
             seat,
             program.actions,
@@ -133,12 +134,11 @@ class AgentRunner:
         )
         self._usage_timer = reactor.call_at(math.inf, self._record_usage)  # at no time, as yet
         self._outcome = AgentOutcome(as_ordered=False, reason="did not end")
-        self._is_closed = False
-        self._takes_data = True
+        self._is_closed, self._takes_data = False, True
 
     def _make_ticks(self, seat: LoopSeat, recorder: Recorder) -> PacedTicks:
         calls = TickCalls(
-            prepare=self._prepare_tick if self._program.has_medium or self._has_devices else None,
+            prepare=self._prepare_tick if self._program.has_medium or self._hardware else None,
             step=self.half.simulation.step,
             end_if_forked=self._reactor.end_if_forked,
             failed=self._step_failed,
@@ -162,9 +162,7 @@ class AgentRunner:
     def set_scheduling(self, grant: Mapping[str, Any]) -> None:
         """Take note of what the kernel granted to the loop."""
         self._report.scheduling = dict(grant)
-        self._journal.event("scheduling", **grant)
-        if grant.get("warning"):
-            self._journal.say("warning", str(grant["warning"]))
+        self._records.scheduling(grant)
 
     def emergency(self, reason: str) -> None:
         """End at once, keep the records, tell the host."""
@@ -285,6 +283,7 @@ class AgentRunner:
         self._usage_timer.reschedule(self._records.usage_due_s + self._session.ping_slack_s)
 
     def _ticks_over(self) -> None:
+        self._device_time.follow()  # where a stop has made the end sooner
         self._last_answers.begin(self._port.local_s(self._ticks.over_s()))
 
     def _step_failed(self, error: BaseException) -> None:
@@ -295,7 +294,7 @@ class AgentRunner:
         """Hand in what comes with the tick at simulated time *t_s*; return whether the agent goes on."""
         if self._program.has_medium and not self._hear(t_s):
             return False
-        return not self._has_devices or self._look_at_devices()
+        return not self._hardware or self._look_at_devices()
 
     def _report_if_due(self, now_s: float) -> None:
         if now_s >= self._session.ping_due_s and not self._is_closed:
@@ -346,6 +345,7 @@ class AgentRunner:
         self._actions.leave_clock()
         self.half.abandon()
         self._reactor.end_if_forked()
+        self._on_left(self.name)
         self._close_records()
 
     def _close_records(self) -> None:

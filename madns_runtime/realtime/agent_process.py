@@ -6,13 +6,14 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from madns_runtime.config import AgentLaunch
 from madns_runtime.errors import MadnsError
 from madns_runtime.faults.intended_losses import RETURN_S_MIN
+from madns_runtime.hardware.port import Hardware
 from madns_runtime.plugin.half import RoleProgram
 from madns_runtime.reactor.descriptors import allow_descriptors
 from madns_runtime.reactor.operator_link import OPERATOR_SIDE_GONE
@@ -32,6 +33,18 @@ HANG_GRACE_S = 2.0
 """Time beyond that for shutdown: an agent that hangs in its plug-in ends itself, and leaves its stack."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SupervisorCalls:
+    """Calls that a supervisor hands to a process of agents, for the child."""
+
+    hardware_of: Callable[[str], Hardware]
+    """Returns the devices that an agent uses, as one that starts sees them."""
+    tell_killed: Callable[[str, str, float | None], None]
+    """Tells that a fault ends this process now, and the time until its return, s."""
+    tell_left: Callable[[str], None]
+    """Tells that an agent has ended, while others of the process may go on."""
+
+
 class AgentProcess:
     """
     The agents of one process in their loop.
@@ -41,7 +54,7 @@ class AgentProcess:
         seats: This process's agents.
         program: What they run.
         life_fd: Closes when the supervisor is gone.
-        tell_killed: Tells the supervisor that a fault ends this process now, and the time until its return, s.
+        supervisor: What the supervisor does for it.
     """
 
     def __init__(
@@ -51,7 +64,7 @@ class AgentProcess:
         program: RoleProgram,
         *,
         life_fd: int,
-        tell_killed: Callable[[str, str, float | None], None],
+        supervisor: SupervisorCalls,
     ) -> None:
         self._reactor = Reactor()
         self._supervisor_pid = os.getppid()
@@ -61,7 +74,7 @@ class AgentProcess:
         self._life_fd = life_fd
         self._runners: dict[str, AgentRunner] = {}
         self._outcomes: dict[str, AgentOutcome] = {}
-        self._tell_killed = tell_killed
+        self._supervisor = supervisor
         self._dropped: dict[str, float | None] = {}
         """Agents that a fault is ending, with the time until their return, s."""
         self._away: set[str] = set()
@@ -116,6 +129,7 @@ class AgentProcess:
             process=self._process,
             pack=self._packs[seat.name],
             on_ended=self._ended,
+            on_left=self._left,
             on_killed=self._killed,
             counted=self._counted.get(seat.name, {}),
         )
@@ -127,7 +141,7 @@ class AgentProcess:
     def _killed(self, name: str, reason: str, after_s: float | None) -> None:
         """End the process if it is the agent's alone, else drop the agent's half."""
         if len(self._seats) == 1:
-            self._tell_killed(name, reason, after_s)
+            self._supervisor.tell_killed(name, reason, after_s)
             # What it has started would live on; one that hangs in letting go of it ends by the alarm.
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.alarm(ABANDON_S)
@@ -140,6 +154,14 @@ class AgentProcess:
         drop = partial(self._runners[name].emergency, reason)
         self._reactor.call_at(self._reactor.now_s(), drop)
 
+    def _left(self, name: str) -> None:
+        """Have the outputs that an agent owns made safe: it has ended, and others may keep the process."""
+        if self._seat_of(name).hardware:
+            self._supervisor.tell_left(name)
+
+    def _seat_of(self, name: str) -> LoopSeat:
+        return next(seat for seat in self._seats if seat.name == name)
+
     def _return(self, seat: LoopSeat) -> None:
         """Make an agent anew that was dropped."""
         if self._is_ending:
@@ -147,6 +169,8 @@ class AgentProcess:
         self._away.discard(seat.name)
         self._process.awaited -= 1
         self._incarnations[seat.name] += 1
+        # Of its earlier start's devices it knows nothing: no status, and nothing that found no room there.
+        seat = replace(seat, hardware=self._supervisor.hardware_of(seat.name))
         try:
             self._runners[seat.name] = runner = self._make_runner(seat)
         except MadnsError as error:  # the others of the process go on; the host misses it
@@ -181,10 +205,9 @@ class AgentProcess:
             self._outcomes[name] = replace(outcome, as_ordered=True, may_restart=False)
             after_s = self._dropped.pop(name)
             if after_s is not None and not self._is_ending:
-                seat = next(seat for seat in self._seats if seat.name == name)
                 self._away.add(name)
                 due_s = self._reactor.now_s() + max(after_s, RETURN_S_MIN)
-                self._reactor.call_at(due_s, partial(self._return, seat))
+                self._reactor.call_at(due_s, partial(self._return, self._seat_of(name)))
         self._stop_if_done()
 
     def _stop_if_done(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from time import monotonic
@@ -123,14 +122,3 @@ def how_ended(code: int, signal_name: str | None, reason: str | None, *, where: 
     if reason is not None:
         return reason
     return "ended" if code == 0 else f"exit code {code}{where}"
-
-
-def make_reason_pipe() -> tuple[int, int]:
-    """
-    Return the ends of the pipe by which children tell how they ended.
-
-    Reaping empties it, too: the loop's reader, called afterwards in the same turn, finds nothing and does not wait.
-    """
-    read_fd, write_fd = os.pipe()
-    os.set_blocking(read_fd, False)
-    return read_fd, write_fd

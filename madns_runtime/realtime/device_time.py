@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from time import monotonic
 
 from madns_runtime.hardware.port import Hardware
@@ -19,11 +20,14 @@ class DeviceTime:
     Args:
         hardware: The devices.
         port: Knows simulated time.
+        end_s: Returns when it ends, s.
     """
 
-    def __init__(self, hardware: Hardware, port: AgentPort) -> None:
+    def __init__(self, hardware: Hardware, port: AgentPort, end_s: Callable[[], float]) -> None:
         self._hardware = hardware
+        hardware.use_clock(port.local_s)
         self._port = port
+        self._end_s, self._told_end_s = end_s, 0.0
         self._local_s = self._t_s = 0.0
         self._rate = 1.0
 
@@ -33,11 +37,13 @@ class DeviceTime:
             port, local_s = self._port, monotonic()
             self._local_s, self._t_s = local_s, port.at(local_s)
             self._rate = port.session.clock.rate(local_s, RATE_SPAN_S)
-            self._hardware.tell_time(local_s, self._t_s, self._rate)
+            self._told_end_s = self._end_s()
+            self._hardware.tell_time(local_s, self._t_s, self._rate, self._told_end_s)
 
     def follow(self) -> None:
-        """Tell it anew if what was told holds no longer: the estimate has learnt, is slewed, or was put wrong."""
+        """Tell it anew if what was told holds no longer: the estimate has learnt, is slewed, or was put wrong, or the end is sooner."""
         local_s = monotonic()
         told_s = self._t_s + (local_s - self._local_s) * self._rate
-        if abs(told_s - self._port.at(local_s)) > ERROR_S_MAX:
+        is_wrong = abs(told_s - self._port.at(local_s)) > ERROR_S_MAX
+        if is_wrong or self._told_end_s != self._end_s():
             self.tell()

@@ -10,7 +10,7 @@ from typing import Any
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.faults.clock_faults import FaultableClock
 from madns_runtime.hardware.fault_actions import check_fault, check_fault_fits
-from madns_runtime.hardware.port import ORDERS_FROM
+from madns_runtime.hardware.fault_orders import timeline_order
 from madns_runtime.health.stress_process import (
     end_stress_processes,
     reap,
@@ -132,4 +132,4 @@ class OrderedActions(AgentActions):
             check_fault_fits(word, device.channels.values())
         except ConfigurationError as error:
             raise ActionRefused(str(error)) from None
-        device.order_fault(ORDERS_FROM + order.number, word, value)
+        device.order_fault(timeline_order(order.number, is_end=order.is_end), word, value)

@@ -43,6 +43,12 @@ class ProcessRecords:
         self.device_account: dict[str, Any] = {}
         """Counts for the host of losses between devices and the agent."""
 
+    def scheduling(self, grant: Mapping[str, Any]) -> None:
+        """Record what the kernel granted to the loop."""
+        self._journal.event("scheduling", **grant)
+        if grant.get("warning"):
+            self._journal.say("warning", str(grant["warning"]))
+
     def clock(self, clock: ClockEstimate, now_s: float) -> None:
         """Record the estimate of the host's clock at local time *now_s*, now and then."""
         t_s = self._t_s()

@@ -24,9 +24,8 @@ from madns_runtime.hardware.manager import DeviceManager
 from madns_runtime.health.sampler import SAMPLER_TIMEOUT_S, start_sampler
 from madns_runtime.health.stress import start_stress, stop_stress
 from madns_runtime.partial_file import write_whole
-from madns_runtime.plugin.context import clean_text
 from madns_runtime.plugin.half import RoleProgram
-from madns_runtime.processes import Registration, register
+from madns_runtime.processes import register
 from madns_runtime.reactor.descriptors import ready
 from madns_runtime.reactor.forking import end_child, leave_parent
 from madns_runtime.reactor.operator_link import OPERATOR_GONE, OperatorLink, tell_loading
@@ -34,17 +33,16 @@ from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.reattachment import way_back_of
 from madns_runtime.reactor.scheduling import freeze_garbage, outlive_parent
 from madns_runtime.realtime.agent_calls import AgentCalls, LoopSeat
-from madns_runtime.realtime.agent_process import AgentProcess
-from madns_runtime.realtime.agent_report import AgentOutcome, how_ended, make_reason_pipe
+from madns_runtime.realtime.agent_process import AgentProcess, SupervisorCalls
+from madns_runtime.realtime.agent_report import how_ended
 from madns_runtime.realtime.host_end import watch_host_end
+from madns_runtime.realtime.outcome_pipe import OutcomePipe
 
 RESTART_DELAY_S = 0.2
 KILL_GRACE_S = 3.0
 """Time beyond that for shutdown: a process that cannot even do that is killed."""
 KILL_WAIT_S = 2.0
 FLUSH_TIMEOUT_S = 2.0
-REASON_BYTES_MAX = 2048
-"""A reason is written in one piece, so that those of two children never mix."""
 
 
 @dataclass(slots=True)
@@ -95,7 +93,7 @@ class Supervisor:
         self._stress = start_stress(config.health.stress_workers)
         self._devices = DeviceManager(launch, tell=partial(tell_loading, fds[1]))
         self._life_read_fd, self._life_write_fd = os.pipe()
-        self._reason_read_fd, self._reason_write_fd = make_reason_pipe()
+        self._outcomes = OutcomePipe()
         self._children: dict[int, SupervisedProcess] = {}
         self._is_ending = self._is_run_over = False
         self._failed = False
@@ -130,7 +128,7 @@ class Supervisor:
         reactor.on_signal(signal.SIGTERM, lambda: self._end("SIGTERM"))
         # A terminal's Ctrl-C is the operator's, but for who was started by hand, on a terminal of its own.
         reactor.on_signal(signal.SIGINT, lambda: self._end("SIGINT") if self._is_by_hand else None)
-        reactor.add_reader(self._reason_read_fd, self._read_outcomes)
+        reactor.add_reader(self._outcomes.read_fd, self._read_outcomes)
         self._devices.watch(reactor, self._operator.emit)
         self._reap()
         reactor.run()
@@ -159,7 +157,7 @@ class Supervisor:
         code = 1
         try:
             shared = self._devices.fds_of(agents)
-            leave_parent(keep={self._life_read_fd, self._reason_write_fd, *shared})
+            leave_parent(keep={self._life_read_fd, self._outcomes.write_fd, *shared})
             with register(
                 self._launch.config.run, "agent", ",".join(agents), self._launch.directory
             ) as entry:
@@ -171,53 +169,30 @@ class Supervisor:
                     ],
                     replace(self._program, incarnation=incarnation),
                     life_fd=self._life_read_fd,
-                    tell_killed=partial(self._write_killed, entry),
+                    supervisor=SupervisorCalls(
+                        hardware_of=self._devices.hardware_of,
+                        tell_killed=partial(self._outcomes.write_killed, entry),
+                        tell_left=self._outcomes.write_left,
+                    ),
                 )
                 outcomes = process.run()
             code = 0 if all(outcome.as_ordered for outcome in outcomes.values()) else 1
-            self._write_outcomes(outcomes)
+            self._outcomes.write_outcomes(outcomes)
         except MadnsError as error:
-            self._write_failure(str(error))
+            self._outcomes.write_failure(str(error))
         except BaseException as error:  # noqa: BLE001 - the last frame of a process; it is told below
-            self._write_failure(f"{type(error).__name__}: {error}")
+            self._outcomes.write_failure(f"{type(error).__name__}: {error}")
             sys.excepthook(type(error), error, error.__traceback__)
         finally:
             end_child(code)
 
-    def _write_failure(self, reason: str) -> None:
-        """Leave word of what ended the process of all its agents: it is none's in particular."""
-        outcome = AgentOutcome(as_ordered=False, reason=reason, may_restart=True)
-        self._write_outcomes({"": outcome})
-
-    def _write_outcomes(self, outcomes: Mapping[str, AgentOutcome]) -> None:
-        for agent, outcome in outcomes.items():
-            told = {
-                "pid": os.getpid(),
-                "agent": agent,
-                "as_ordered": outcome.as_ordered,
-                "reason": clean_text(outcome.reason)[: REASON_BYTES_MAX // 4],
-                "may_restart": outcome.may_restart,
-                "is_run_over": outcome.is_run_over,
-            }
-            os.write(self._reason_write_fd, orjson.dumps(told) + b"\n")
-
-    def _write_killed(
-        self, entry: Registration, agent: str, reason: str, after_s: float | None
-    ) -> None:
-        """Leave word, as a child that ends without another."""
-        entry.remove()
-        told = {"pid": os.getpid(), "agent": agent, "killed": reason, "returns_after_s": after_s}
-        os.write(self._reason_write_fd, orjson.dumps(told) + b"\n")
-
     def _read_outcomes(self) -> None:
-        try:
-            data = os.read(self._reason_read_fd, 65_536)
-        except BlockingIOError:
-            return
-        for line in data.splitlines():
-            told = orjson.loads(line)
+        for told in self._outcomes.read():
             child = self._children.get(told["pid"])
             if child is None:
+                continue
+            if "left" in told:
+                self._devices.agent_left(told["agent"])
                 continue
             if "killed" in told:
                 child.is_killed, child.returns_after_s = True, told["returns_after_s"]
@@ -244,7 +219,7 @@ class Supervisor:
 
     def _child_ended(self, child: SupervisedProcess, status: int) -> None:
         code = os.waitstatus_to_exitcode(status)
-        while ready([self._reason_read_fd], [], 0)[0]:
+        while ready([self._outcomes.read_fd], [], 0)[0]:
             self._read_outcomes()
         where = child.calls.interrupted(child.agents)
         if code == 0 and not child.has_ended_well:

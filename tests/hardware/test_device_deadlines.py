@@ -239,6 +239,24 @@ def test_outputs_are_safe_after_the_owners_end(tmp_path, log, waits, does_hang):
 
 
 @pytest.mark.parametrize("does_hang", [False, True])
+def test_outputs_are_safe_after_the_end_of_an_owner_whose_process_goes_on(
+    tmp_path, log, waits, does_hang
+):
+    bench = moved_bench(tmp_path, hang_file=str(tmp_path / "hang"))
+    bench.manager.agents_started((AGENT,), os.getpid())
+    if does_hang:
+        (tmp_path / "hang").touch()
+        bench.run(0.2)  # it is in its read by then
+    began_s = time.monotonic()
+    bench.manager.agent_left(AGENT)
+    bench.until(lambda: bool(log.notes("SAFE", began_s)), timeout_s=60.0)
+    (tmp_path / "hang").unlink(missing_ok=True)
+    bench.close()
+
+    assert_within(SAFE_S_MAX, began_s, log.first("SAFE", began_s), waits)
+
+
+@pytest.mark.parametrize("does_hang", [False, True])
 def test_outputs_are_safe_after_the_end_of_the_run(tmp_path, log, waits, does_hang):
     bench = moved_bench(tmp_path, hang_file=str(tmp_path / "hang"))
     if does_hang:

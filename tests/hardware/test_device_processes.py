@@ -552,6 +552,30 @@ def test_a_disconnected_device_stays_so_for_longer_than_a_hang_and_through_a_new
     assert result["restarts"] == 1  # by the test's own kill
 
 
+def test_a_disconnected_device_hands_on_no_sample_that_a_delay_holds(tmp_path):
+    with line_bench(tmp_path) as (bench, _):
+        line, insert = bench.hardware["line"], bench.manager.insert_fault
+        bench.until(lambda: line.status == "ok")
+        insert("pi22/line", "delay", 0.5)
+        bench.run(0.6)
+        insert("pi22/line", "disconnect", None)
+        bench.until(lambda: line.status == "lost")
+        number = line["time"].number
+        bench.run(0.8)
+        assert line["time"].number == number
+        insert("pi22/line", "clear", None)
+        bench.until(lambda: line["time"].number > number)
+        insert("pi22/line", "delay", 60.0)
+        samples = bench.manager.page_of("pi22/line").header
+        before = samples[page.SAMPLES]
+        bench.until(lambda: samples[page.SAMPLES] > before + 5)
+        insert("pi22/line", "disconnect", None)
+        bench.until(lambda: line.status == "lost")
+        report = bench.close()["pi22/line"]["report"]
+
+    assert report["delayed_left"] >= 5
+
+
 def test_a_recording_that_is_opened_anew_goes_on_and_does_not_begin_anew(tmp_path):
     recorded = tmp_path / "recorded"
     recorded.mkdir()

@@ -282,3 +282,43 @@ def test_frames_that_an_agent_does_not_take_are_told_by_it_and_in_the_verdict(tm
         agent / "events.jsonl"
     ).read_text("utf-8")
     assert f"frames_missed {missed}" in (agent / "log.jsonl").read_text("utf-8")
+
+
+SHARING = """
+name: sharing
+simulation: counter
+agents: {count: 2, tick_hz: 10}
+time: {duration_s: 6}
+on_agent_loss: continue
+hardware:
+  use: [{devices: [gyro], agents: ["*"]}]
+timeline:
+  - {at_s: 0.5, action: device_fault, agents: [agent-01], device: gyro, fault: freeze, for_s: 0.3}
+  - {at_s: 1.2, action: device_fault, agents: [agent-02], device: gyro, fault: bias, value: 1000, for_s: 3.5}
+  - {at_s: 1.5, action: restart, agents: [agent-01]}
+"""
+SHARED = """
+all:
+  hosts:
+    here:
+      ansible_connection: local
+      cosmos_devices: [{name: gyro, kind: synthetic, rate_hz: 20}]
+"""
+
+
+def test_an_agent_that_returns_ends_no_newer_fault_of_a_device_that_others_share(tmp_path):
+    (tmp_path / "sharing.yaml").write_text(SHARING)
+    (tmp_path / "here.yaml").write_text(SHARED)
+    cosmos = CosmosCommand(tmp_path)
+
+    _, document = cosmos.run(
+        tmp_path / "sharing.yaml",
+        *LOOSE,
+        options=("--no-report", "-i", str(tmp_path / "here.yaml")),
+    )
+
+    lines = (cosmos.directory(document) / "devices/here/gyro/events.jsonl").read_text().splitlines()
+    faults = [event for event in map(json.loads, lines) if event.get("event") == "fault"]
+    assert [event["action"] for event in faults] == ["freeze", "clear", "bias", "clear"]
+    assert document["agents"]["lost_on_purpose"] == ["agent-01"]
+    assert faults[-1]["t_s"] > 4.0

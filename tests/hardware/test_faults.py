@@ -102,6 +102,20 @@ def test_disconnect_lasts_until_clear():
     assert not faults.is_disconnected
 
 
+def test_a_device_that_is_disconnected_hands_on_nothing_that_a_delay_holds_until_clear():
+    faults = InsertedFaults(1)
+    faults.insert("delay", 0.5)
+    assert faults.apply(sample(1.0, 10.0)) is None
+    assert faults.apply(sample(2.0, 10.1)) is None
+
+    faults.insert("disconnect")
+    assert (faults.next_due_s(), faults.due(20.0)) == (math.inf, [])
+    faults.insert("clear")
+
+    assert [each.taken_s for each in faults.due(20.0)] == [10.0, 10.1]
+    assert faults.forget_held() == 0
+
+
 @pytest.mark.parametrize(
     ("action", "value", "text"),
     [

@@ -118,9 +118,9 @@ def test_simulated_time_is_told_by_whoever_knows_it():
     shared = DevicePage((TEMPERATURE,))
 
     assert shared.time.read() is None
-    shared.time.write(1000.0, 5.0, 1.00001)
+    shared.time.write(1000.0, 5.0, 1.00001, 60.0)
 
-    assert shared.time.read() == (1000.0, 5.0, 1.00001)
+    assert shared.time.read() == (1000.0, 5.0, 1.00001, 60.0)
 
 
 @pytest.mark.process

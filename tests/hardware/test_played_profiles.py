@@ -215,6 +215,48 @@ def test_a_process_plays_a_profile_of_one_message_and_tells_how_late_it_was(tmp_
 
 
 @pytest.mark.process
+def test_a_process_puts_out_nothing_that_is_due_behind_the_runs_end(tmp_path):
+    with line_bench(tmp_path) as (bench, terminal):
+        bench.until(lambda: "ok" in bench.statuses("line"))
+        port, zero_s = bench.hardware["line"], bench.start_time()
+        bench.hardware.use_clock(lambda t_s: zero_s + t_s)
+        port.play("valve", [(0.1 + k / 10, 0.1 + k / 100) for k in range(20)])
+        bench.until(lambda: "VALVE 0.1" in terminal.heard())
+        bench.hardware.tell_time(zero_s, 0.0, 1.0, 1.0)  # as a stop makes the end sooner
+        bench.until(lambda: bench.reactor.now_s() > zero_s + 1.5)
+        port.write("valve", 0.75)  # as an agent does that sums up
+        bench.until(lambda: "VALVE 0.75" in terminal.heard())
+        port.play("valve", [(1.5, 0.8), (60.0, 0.9)])
+        bench.run(0.2)
+        report = bench.close()["pi22/line"]["report"]
+
+    told = report["stimulus"]["valve"]
+    rows = list(read_stream(tmp_path / "devices" / "pi22" / "line" / "valve.jsonl").records())
+    assert [value for t_s, _, value in rows if t_s >= 1.0] == [0.75]
+    assert (told["points"], told["underruns"]) == (22, 0)
+    assert (
+        told["unplayed"] >= 13
+    )  # of 1.0 s and later, and more where the machine was busy at the end
+    assert told["points"] == told["played"] + told["skipped"] + told["unplayed"]
+
+
+@pytest.mark.process
+def test_writes_that_are_due_behind_the_runs_end_are_left(tmp_path):
+    with line_bench(tmp_path) as (bench, terminal):
+        bench.until(lambda: "ok" in bench.statuses("line"))
+        zero_s = bench.start_time()
+        bench.hardware.tell_time(zero_s, 0.0, 1.0, 1.0)
+        bench.hardware.use_clock(lambda t_s: zero_s + t_s)
+        bench.hardware["line"].write("valve", 0.5, due_s=1.2)
+        bench.until(lambda: bench.reactor.now_s() > zero_s + 1.5)
+        report = bench.close()["pi22/line"]["report"]
+        heard = terminal.heard()
+
+    assert report["writes_left"] == 1
+    assert not [word for word in heard if word.startswith("VALVE")]
+
+
+@pytest.mark.process
 def test_points_of_a_device_that_is_gone_are_lost_and_counted_over_its_processes(tmp_path):
     with line_bench(tmp_path) as (bench, terminal):
         bench.until(lambda: "ok" in bench.statuses("line"))

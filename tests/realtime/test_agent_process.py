@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from madns_runtime.config import Agents
+from madns_runtime.hardware.port import Hardware
 from madns_runtime.plugin.half import HalfFailed, RoleProgram
 from madns_runtime.protocol.codec import NO_DATA
 from madns_runtime.protocol.events import ClockEstimated, HostDataReceived
@@ -12,15 +13,23 @@ from madns_runtime.protocol.messages import ActionOrder
 from madns_runtime.protocol.states import AgentState
 from madns_runtime.realtime import agent_process
 from madns_runtime.realtime.agent import AgentRunner
-from madns_runtime.realtime.agent_process import AgentProcess
+from madns_runtime.realtime.agent_calls import AgentCalls, LoopSeat
+from madns_runtime.realtime.agent_process import AgentProcess, SupervisorCalls
 from madns_runtime.realtime.agent_report import AgentOutcome
+
+SUPERVISOR = SupervisorCalls(
+    hardware_of=lambda agent: Hardware(),
+    tell_killed=lambda *told: None,
+    tell_left=lambda agent: None,
+)
 
 
 def test_an_agent_that_returns_is_given_what_its_conditions_had_counted(monkeypatch):
-    given = []
+    given, devices = [], []
 
     def make(seat, launch, program, **more):
         given.append((program.incarnation, more["counted"]))
+        devices.append(seat.hardware)
         return SimpleNamespace(
             counted=lambda: {3: 10 * program.incarnation},
             start=lambda: None,
@@ -31,11 +40,11 @@ def test_an_agent_that_returns_is_given_what_its_conditions_had_counted(monkeypa
     reactor = SimpleNamespace(
         now_s=lambda: 0.0, call_at=lambda due_s, call: call(), end_if_forked=lambda: None
     )
-    seat = SimpleNamespace(name="a")
+    seat = LoopSeat("a", 0, AgentCalls(), Hardware())
     program = RoleProgram(make=object, parameters=None)
     process = AgentProcess.__new__(AgentProcess)
     monkeypatch.setattr(agent_process, "Reactor", lambda: reactor)
-    process.__init__(None, [seat], program, life_fd=-1, tell_killed=lambda *told: None)
+    process.__init__(None, [seat], program, life_fd=-1, supervisor=SUPERVISOR)
     process._process = SimpleNamespace(awaited=2)
     process._packs = {"a": None}
     process._runners = {"a": process._make_runner(seat)}
@@ -44,6 +53,9 @@ def test_an_agent_that_returns_is_given_what_its_conditions_had_counted(monkeypa
         process._ended("a", AgentOutcome(as_ordered=False, reason="on purpose"))
 
     assert given == [(1, {}), (2, {3: 10}), (3, {3: 20})]
+    assert (
+        len({id(each) for each in devices}) == 3
+    )  # nothing of the devices as an earlier start saw them
 
 
 def test_an_agent_that_cannot_be_made_again_leaves_the_others_of_its_process_alone(monkeypatch):
@@ -63,10 +75,10 @@ def test_an_agent_that_cannot_be_made_again_leaves_the_others_of_its_process_alo
         end_if_forked=lambda: None,
         stop=lambda: stops.append(True),
     )
-    seats = [SimpleNamespace(name="a"), SimpleNamespace(name="b")]
+    seats = [LoopSeat(name, 0, AgentCalls(), Hardware()) for name in "ab"]
     program = RoleProgram(make=object, parameters=None)
     monkeypatch.setattr(agent_process, "Reactor", lambda: reactor)
-    process = AgentProcess(None, seats, program, life_fd=-1, tell_killed=lambda *told: None)
+    process = AgentProcess(None, seats, program, life_fd=-1, supervisor=SUPERVISOR)
     process._process = SimpleNamespace(awaited=1, close_if_unused=lambda: None)
     process._packs = dict.fromkeys("ab")
     process._runners = {seat.name: process._make_runner(seat) for seat in seats}
@@ -91,7 +103,7 @@ def test_every_pack_of_a_process_is_timed_anew_with_the_clock_that_they_share(mo
     process._reactor = SimpleNamespace(call_at=lambda due_s, call: None, end_if_forked=lambda: None)
     process._launch = SimpleNamespace(config=config, packs_elsewhere=None)
     process._seats = [SimpleNamespace(name=name) for name in config.agents.resolved_names()]
-    process._program = RoleProgram(make=object, parameters=None)
+    process._program, process._supervisor = RoleProgram(make=object, parameters=None), SUPERVISOR
     process._packs, process._incarnations, process._counted = {}, {}, {}
 
     packs = process._make_runners()
@@ -138,8 +150,9 @@ def test_what_comes_when_an_agents_half_is_called_no_more_is_counted():
 def test_an_agent_that_a_fault_ends_records_no_emergency_where_others_keep_its_process(
     has_killed, told
 ):
-    said = []
+    said, left = [], []
     runner = AgentRunner.__new__(AgentRunner)
+    runner.name, runner._on_left = "agent-2", left.append
     runner._ticks = SimpleNamespace(pacer=SimpleNamespace(is_over=False))
     runner._faults = SimpleNamespace(has_killed=has_killed)
     runner._journal = SimpleNamespace(emergency=said.append)
@@ -151,6 +164,7 @@ def test_an_agent_that_a_fault_ends_records_no_emergency_where_others_keep_its_p
     runner._end_early("agent-2: why", is_own=True)
 
     assert said == told
+    assert left == ["agent-2"]  # what it owns is made safe though its process goes on
 
 
 def test_the_last_agent_of_a_process_that_a_fault_ends_keeps_the_socket_for_its_return(monkeypatch):
@@ -163,7 +177,7 @@ def test_the_last_agent_of_a_process_that_a_fault_ends_keeps_the_socket_for_its_
         ),
     )
     seats = [SimpleNamespace(name=name) for name in "ab"]
-    process = AgentProcess(None, seats, None, life_fd=-1, tell_killed=lambda *told: None)
+    process = AgentProcess(None, seats, None, life_fd=-1, supervisor=SUPERVISOR)
     process._process = SimpleNamespace(awaited=0, close_if_unused=lambda: None)
 
     def end(reason):
@@ -186,7 +200,7 @@ def test_a_process_waits_for_nobody_who_was_to_return_to_a_run_that_is_over(monk
     stops = []
     reactor = SimpleNamespace(now_s=lambda: 0.0, stop=lambda: stops.append(True))
     monkeypatch.setattr(agent_process, "Reactor", lambda: reactor)
-    process = AgentProcess(None, [], None, life_fd=-1, tell_killed=lambda *told: None)
+    process = AgentProcess(None, [], None, life_fd=-1, supervisor=SUPERVISOR)
     process._process = SimpleNamespace(awaited=1, close_if_unused=lambda: None)
     process._away = {"a"}
     process._runners = {"b": SimpleNamespace(counted=dict)}

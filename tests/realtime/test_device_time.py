@@ -21,9 +21,13 @@ class Bench:
         monkeypatch.setattr(device_time, "monotonic", lambda: self.now_s)
         self.clock = FaultableClock()
         self.fly(20.0)
-        port = SimpleNamespace(session=SimpleNamespace(clock=self.clock), at=self.t_s)
-        hardware = SimpleNamespace(tell_time=lambda *told: self.told.append(told))
-        self.time = DeviceTime(hardware, port)
+        session = SimpleNamespace(clock=self.clock)
+        port = SimpleNamespace(session=session, at=self.t_s, local_s=None)
+        hardware = SimpleNamespace(
+            tell_time=lambda *told: self.told.append(told), use_clock=lambda local_s: None
+        )
+        self.end_s = 600.0
+        self.time = DeviceTime(hardware, port, lambda: self.end_s)
         self.time.tell()
 
     def t_s(self, local_s):
@@ -41,7 +45,7 @@ class Bench:
         errors_s = []
         for _ in range(round(for_s / TICK_S)):
             self.now_s += TICK_S
-            local_s, t_s, rate = self.told[-1]
+            local_s, t_s, rate, _ = self.told[-1]
             told_s = t_s + (self.now_s - local_s) * rate
             errors_s.append(abs(told_s - self.t_s(self.now_s)))
             self.time.follow()
@@ -76,3 +80,11 @@ def test_a_clock_that_steps_is_told_in_the_next_tick(bench):
 
     assert bench.tick(2 * TICK_S) == pytest.approx([0.2, 0.0], abs=1e-6)
     assert len(bench.told) == 2
+
+
+def test_a_stop_that_makes_the_end_sooner_is_told_in_the_next_tick(bench):
+    bench.end_s = 30.0
+
+    bench.tick(2 * TICK_S)
+
+    assert [told[-1] for told in bench.told] == [600.0, 30.0]

@@ -11,26 +11,27 @@ import pytest
 
 from madns_runtime.config import Agents
 from madns_runtime.realtime.agent_calls import AgentCalls
-from madns_runtime.realtime.agent_report import AgentOutcome, make_reason_pipe
+from madns_runtime.realtime.agent_report import AgentOutcome
+from madns_runtime.realtime.outcome_pipe import OutcomePipe
 from madns_runtime.realtime.supervisor import RESTART_DELAY_S, SupervisedProcess, Supervisor
 
 
 def test_a_reader_that_finds_nothing_after_reaping_does_not_wait():
     supervisor = Supervisor.__new__(Supervisor)
     supervisor._children = {}
-    supervisor._reason_read_fd, write_fd = make_reason_pipe()
+    supervisor._outcomes = pipe = OutcomePipe()
     told = (
         b'{"pid": 1, "agent": "agent-01", "as_ordered": true, "reason": "", "may_restart": false}\n'
     )
-    os.write(write_fd, told)
+    os.write(pipe.write_fd, told)
     signal.alarm(20)  # ends a test that waits
     try:
         supervisor._read_outcomes()  # as reaping does
         supervisor._read_outcomes()  # as the loop does, which had found it readable before
     finally:
         signal.alarm(0)
-        os.close(supervisor._reason_read_fd)
-        os.close(write_fd)
+        os.close(pipe.read_fd)
+        os.close(pipe.write_fd)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +56,7 @@ def test_ends_on_purpose_are_no_failures_after_which_an_agent_is_not_started_aga
 def test_nobody_is_started_anew_once_one_tells_that_the_run_is_over():
     stopped = []
     supervisor = Supervisor.__new__(Supervisor)
-    supervisor._reason_read_fd, supervisor._reason_write_fd = make_reason_pipe()
+    supervisor._outcomes = pipe = OutcomePipe()
     supervisor._is_ending = supervisor._is_run_over = False
     supervisor._devices = SimpleNamespace(reap=lambda: None)
     supervisor._reactor = SimpleNamespace(stop=lambda: stopped.append(True))
@@ -63,14 +64,14 @@ def test_nobody_is_started_anew_once_one_tells_that_the_run_is_over():
     ended = SupervisedProcess(("agent-02",), os.getpid(), 1, AgentCalls())
     supervisor._to_fork, supervisor._children = [away.agents], {os.getpid(): ended}
 
-    supervisor._write_outcomes({"agent-02": AgentOutcome(as_ordered=True, is_run_over=True)})
+    pipe.write_outcomes({"agent-02": AgentOutcome(as_ordered=True, is_run_over=True)})
     supervisor._read_outcomes()
     supervisor._children.clear()
     supervisor._restart(away)
 
     assert (stopped, supervisor._children) == ([True], {})
     assert not supervisor._may_restart(away)
-    for fd in (supervisor._reason_read_fd, supervisor._reason_write_fd):
+    for fd in (pipe.read_fd, pipe.write_fd):
         os.close(fd)
 
 
@@ -143,15 +144,15 @@ def test_what_ended_a_process_is_told_as_nobodys_in_particular(agents, who, told
     supervisor = Supervisor.__new__(Supervisor)
     child = SupervisedProcess(agents, os.getpid(), 1, AgentCalls())
     supervisor._children = {os.getpid(): child}
-    supervisor._reason_read_fd, supervisor._reason_write_fd = make_reason_pipe()
+    supervisor._outcomes = pipe = OutcomePipe()
     outcome = AgentOutcome(as_ordered=False, reason="no room", may_restart=True)
     if who is None:
-        supervisor._write_failure("no room")
+        pipe.write_failure("no room")
     else:
-        supervisor._write_outcomes({who: outcome})
+        pipe.write_outcomes({who: outcome})
 
     supervisor._read_outcomes()
 
     assert (child.reason, child.may_restart) == (told, True)
-    os.close(supervisor._reason_read_fd)
-    os.close(supervisor._reason_write_fd)
+    os.close(pipe.read_fd)
+    os.close(pipe.write_fd)
