@@ -145,9 +145,10 @@ def test_a_fault_is_inserted_in_a_living_run_and_recorded(tmp_path):
     settings = ("time.duration_s=200", "hardware.stale_ratio=0.9")
     with cosmos.start_run(scenario, *LOOSE, *settings) as process:
         wait_until(
-            lambda: list(cosmos.runs.glob("*/devices/agent-02/tank/level.jsonl")), "a sample"
+            lambda: list(cosmos.runs.glob("*/devices/agent-02/tank/level.jsonl")), "a device"
         )
         (folder,) = cosmos.runs.iterdir()
+        wait_until(lambda: levels_of(folder), "a sample without a fault, of simulated time")
         assert (folder / ".orders.sock").stat().st_mode & 0o777 == 0o600
 
         put = cosmos("inject", "last", "agent-02/tank", "bias", "1000000")
@@ -178,9 +179,14 @@ def test_a_fault_is_inserted_in_a_living_run_and_recorded(tmp_path):
 
 def largest(folder):
     """Return the largest level on record so far."""
+    return max(levels_of(folder), default=0.0)
+
+
+def levels_of(folder):
+    """Return the levels on record so far."""
     lines = (folder / "devices/agent-02/tank/level.jsonl").read_bytes().splitlines(keepends=True)
     whole = [line for line in lines if line.startswith(b"[") and line.endswith(b"\n")]
-    return max((json.loads(line)[-1] for line in whole), default=0.0)
+    return [json.loads(line)[-1] for line in whole]
 
 
 def test_a_detached_run_takes_faults_and_ends_by_the_name_of_a_lost_device(tmp_path):
