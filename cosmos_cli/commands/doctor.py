@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import sys
 import time
 from collections import Counter
@@ -56,6 +57,8 @@ COLUMNS = (
     Column("found"),
     Column("cure"),
 )
+OF_MACHINES = re.compile(r"^(`cosmos (?:up|reboot|wipe))(?: -i INVENTORY)?(?=[ `])")
+"""A command that is the cure itself, and wants an inventory; one behind a line of the inventory names none."""
 HERE_ADDRESS = "127.0.0.1"
 LATENCY_S_UNKNOWN = 0.5e-3
 
@@ -137,15 +140,13 @@ def doctor(
 def with_machines(findings: Sequence[Finding]) -> list[Finding]:
     """Return findings whose cures name the inventory that was given: the checks know of none."""
     options = invocation.current().machine_options
-    return [
-        dataclasses.replace(
-            each,
-            remark=dataclasses.replace(
-                each.remark, cure=each.remark.cure.replace(" -i INVENTORY", options)
-            ),
-        )
-        for each in findings
-    ]
+
+    def cured(each: Finding) -> Finding:
+        cure = OF_MACHINES.sub(lambda found: f"{found[1]}{options}", each.remark.cure)
+        cure = cure.replace(" -i INVENTORY", options)
+        return dataclasses.replace(each, remark=dataclasses.replace(each.remark, cure=cure))
+
+    return [cured(each) for each in findings]
 
 
 class _Examination:

@@ -24,17 +24,21 @@ pytestmark = pytest.mark.process
 
 
 @pytest.mark.parametrize(
-    ("words", "cure"),
+    ("words", "said", "cure"),
     [
-        (("-i", "my box.yaml"), "`cosmos up -i 'my box.yaml'`, then reboot"),
-        ((), "`cosmos up -i INVENTORY`, then reboot"),
+        (("-i", "my box.yaml"), "`cosmos up -i INVENTORY`", "`cosmos up -i 'my box.yaml'`"),
+        ((), "`cosmos up -i INVENTORY`", "`cosmos up -i INVENTORY`"),
+        (("-i", "a.yaml"), "`cosmos up` removes it", "`cosmos up -i a.yaml` removes it"),
+        (("-i", "a.yaml"), "`cosmos wipe --uncollected`", "`cosmos wipe -i a.yaml --uncollected`"),
+        (("-i", "a.yaml"), "`x: 1` there, then `cosmos up`", "`x: 1` there, then `cosmos up`"),
+        (("-i", "a.yaml"), "`cosmos down 7 -i INVENTORY`", "`cosmos down 7 -i a.yaml`"),
     ],
 )
-def test_cure_names_the_inventory_that_was_given(monkeypatch, words, cure):
+def test_cure_names_the_inventory_that_was_given(monkeypatch, words, said, cure):
     monkeypatch.delenv("COSMOS_INVENTORY", raising=False)
     given = Invocation(verb="doctor", words=words, valued=frozenset({"-i"}))
     monkeypatch.setattr(invocation, "current", lambda: given)
-    remark = CheckRemark(found="no package x", cure="`cosmos up -i INVENTORY`, then reboot")
+    remark = CheckRemark(found="no package x", cure=said)
 
     (finding,) = with_machines([Finding(machine="pi01", check="devices", remark=remark)])
 
