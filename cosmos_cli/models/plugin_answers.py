@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.agent_rules import RULES, refused_parameters, rule_document, select_agents
+from cosmos_cli.models.declared_streams import AgentStreams
 from cosmos_cli.models.document import Document
 from cosmos_cli.models.fault_place import fault_found_at
 from cosmos_cli.models.parameter_answers import ParameterAnswers, of_all_agents
@@ -73,6 +74,8 @@ class PluginAnswers:
     """Whole parameters of agents for which others hold."""
     streams: tuple[DeclaredStream, ...] | None = None
     """Streams as it declares them; None if it declares none, or nobody could be asked."""
+    agent_streams: tuple[AgentStreams, ...] = ()
+    """Streams of agents for which it declares others."""
     labels: AgentLabels | None = None
     """Second names of agents; None if the simulation could not be asked for those it gives."""
     device_uses: tuple[DeviceUse, ...] = ()
