@@ -43,6 +43,9 @@ from madns_runtime.recording.columns import joined_column
 from madns_runtime.recording.records import Field
 
 ROWS_PER_GROUP = 128 * 1024
+BYTES_PER_GROUP = 32 << 20
+"""Of the lines that a row group is made of: records of more than 256 bytes each make smaller ones. As values of Python
+and of Arrow they need about four times as much memory."""
 
 
 class TableWriter:
@@ -68,6 +71,7 @@ class TableWriter:
         self._schema = layout.arrow_schema()
         self._held: list[Columns] = []
         self._held_count = 0
+        self._held_bytes = 0
         path.parent.mkdir(parents=True, exist_ok=True)
         # Made before pyarrow opens it by its name: a link that lies there is not followed.
         self._partial, descriptor = create_partial(path, takes_over=True)
@@ -78,11 +82,20 @@ class TableWriter:
             self._partial.unlink(missing_ok=True)  # a full disk takes a file, but nothing in it
             raise
 
-    def add(self, file: RecordFile, columns: Columns, count: int) -> None:
-        """Take a batch of a file's records; a file's batches come one after the other."""
+    def add(self, file: RecordFile, columns: Columns, count: int, size_bytes: int = 0) -> None:
+        """
+        Take a batch of a file's records; a file's batches come one after the other.
+
+        Args:
+            file: Of the records.
+            columns: The batch.
+            count: Number of its records.
+            size_bytes: As lines; 0 where they are numbers alone, which take little.
+        """
         self._held.append(columns)
         self._held_count += count
-        if self._held_count >= ROWS_PER_GROUP:
+        self._held_bytes += size_bytes
+        if self._held_count >= ROWS_PER_GROUP or self._held_bytes >= BYTES_PER_GROUP:
             self.end_file(file)
 
     def end_file(self, file: RecordFile) -> None:
@@ -90,7 +103,7 @@ class TableWriter:
         if self._held_count:
             self._writer.write_table(self._table(file), row_group_size=ROWS_PER_GROUP)
             self.rows += self._held_count
-        self._held, self._held_count = [], 0
+        self._held, self._held_count, self._held_bytes = [], 0, 0
 
     def close(self) -> None:
         """Finish the file and give it its name."""

@@ -127,10 +127,10 @@ class _Table:
             if readable:
                 self._writer = TableWriter(path, layout(readable))
 
-    def add(self, file: RecordFile, columns: Columns, count: int) -> None:
+    def add(self, file: RecordFile, columns: Columns, count: int, size_bytes: int) -> None:
         with self._guarded():
             if self._writer is not None:
-                self._writer.add(file, columns, count)
+                self._writer.add(file, columns, count, size_bytes)
 
     def end_file(self, file: RecordFile) -> None:
         with self._guarded():

@@ -493,6 +493,27 @@ def test_table_of_a_million_rows_is_written_in_little_memory(tmp_path):
     assert values["margin_us"][-1] == (ROWS - 1) % 9973 + 0.25
 
 
+def test_records_of_large_texts_make_row_groups_of_few_and_small_ones_of_many(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr("cosmos_cli.evidence.tables.BYTES_PER_GROUP", 1 << 20)
+    made = SyntheticRun(tmp_path)
+    letters = [chr(ord("a") + index % 26) * 32_768 for index in range(128)]
+    record(
+        made, "agent-01", MIXED, [(0.0, i, 0.0, text, True, None) for i, text in enumerate(letters)]
+    )
+    record(made, "agent-02", MIXED, [(0.0, i, 0.0, "x", True, None) for i in range(10_000)])
+
+    table = gathered_table(made, "mixed")
+
+    file = pq.ParquetFile(table.path)
+    rows = [file.metadata.row_group(index).num_rows for index in range(file.num_row_groups)]
+    assert rows[-1] == 10_000
+    assert max(rows[:-1]) <= 40  # of 32 KiB each
+    assert table.read("agent-01", ("name",))["name"].tolist() == letters
+    assert table.read("agent-01", ("count",))["count"].tolist() == list(range(128))
+
+
 NAMES = {"agent-01": "IRIDIUM 8", "agent-02": "IRIDIUM 7"}
 EPOCH = "2017-03-07T13:32:57Z"
 
