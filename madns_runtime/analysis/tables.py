@@ -22,6 +22,8 @@ from madns_runtime.recording.records import Field
 
 AGENT = "agent"
 INCARNATION = "incarnation"
+OF_OTHER: Final = " · "
+"""In a line's name, between an agent that recorded it and the other one that it is about."""
 HOST_EVENTS: Final = "host_events"
 SHUTDOWN_STATES: Final = ("BEGIN_SHUTDOWN", "EMERGENCY_SHUTDOWN")
 Columns = Mapping[str, NDArray[Any]]
@@ -196,7 +198,7 @@ class RecordedRun:
             agents = table.read(source, (AGENT,))[AGENT].astype(str)
             for agent in dict.fromkeys(agents.tolist()):
                 rows = np.flatnonzero(agents == agent)
-                label = f"{source} · {agent}" if table.role == AGENT else agent
+                label = f"{source}{OF_OTHER}{agent}" if table.role == AGENT else agent
                 found[label] = (x[rows], y[rows])
         return found, axis
 
