@@ -195,9 +195,10 @@ class RecordedRun:
             if not any(field.name == AGENT and field.kind == "str" for field in table.fields):
                 found[source] = (x, y)
                 continue
-            agents = table.read(source, (AGENT,))[AGENT].astype(str)
-            for agent in dict.fromkeys(agents.tolist()):
-                rows = np.flatnonzero(agents == agent)
+            rows_of: dict[str, list[int]] = {}
+            for row, agent in enumerate(table.read(source, (AGENT,))[AGENT].tolist()):
+                rows_of.setdefault(str(agent), []).append(row)
+            for agent, rows in rows_of.items():
                 label = f"{source}{OF_OTHER}{agent}" if table.role == AGENT else agent
                 found[label] = (x[rows], y[rows])
         return found, axis
