@@ -118,7 +118,7 @@ def _figure(
         y=Axis(unit=field.unit),
         note=few if len(named) > AGENTS_DRAWN_MAX else "",
         limits=_limits(expectation, field.unit),
-        returns={name: recorded.returns(table, name) for name in series if name in table.sources},
+        returns=recorded.series_returns(table, series),
     )
 
 

@@ -124,7 +124,7 @@ def field_lines(  # noqa: PLR0913 - a field, and how it is lettered
         y=y,
         note=note,
         group="agents" if is_of_agents else table.role,
-        returns={who: run.returns(table, who) for who in series if who in table.sources},
+        returns=run.series_returns(table, series),
     )
 
 

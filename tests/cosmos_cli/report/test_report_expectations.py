@@ -2,17 +2,22 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
-from harness.synthetic_run import SyntheticRun, make_config
+from harness.synthetic_run import RECORDING, SyntheticRun, make_config
 
 from cosmos_cli.collect.finish import finish_run
 from cosmos_cli.evidence.run_directory import write_json
 from cosmos_cli.evidence.run_documents import EXPECTATIONS
+from cosmos_cli.evidence.tables import open_recorded_run
 from cosmos_cli.models.expectation import Expectation
 from cosmos_cli.report.build import build_sections
-from madns_runtime.analysis.values import Figure
+from madns_runtime.analysis.lines import field_lines
+from madns_runtime.analysis.values import Axis, Figure
 from madns_runtime.conditions.condition import ValueBounds
 from madns_runtime.config import to_mapping
+from madns_runtime.recording.record_files import RecordFiles
+from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.records import Field, StreamSchema
 
 SEEN = StreamSchema("seen", (Field("t_s", "s"), Field("agent", "", "str"), Field("range_m", "m")))
@@ -69,8 +74,36 @@ def test_agents_that_record_others_have_a_line_for_each_of_these(
 def test_the_host_has_a_line_for_each_agent_that_its_records_are_about(tmp_path: Path) -> None:
     made = SyntheticRun(tmp_path, make_config(2)).write()
     recorder = made.recorder("host", "host", SEEN)
-    for agent in ("agent-02", "agent-01"):
+    for agent in ("agent-02", None, "agent-01"):
         recorder.record("seen", (0.0, agent, 1.0))
     recorder.close()
 
-    assert drawn(made, near("host")) == ["agent-02", "agent-01"]
+    assert drawn(made, near("host")) == ["agent-02", "host", "agent-01"]
+
+
+def test_records_about_nobody_are_a_line_of_who_recorded_them(tmp_path: Path) -> None:
+    made = SyntheticRun(tmp_path, make_config(1)).write()
+    for number, name in ((1, "agent-01"), (2, "agent-01")):
+        folder = tmp_path / str(number)
+        files = RecordFiles(folder, run=made.run.name, source=name)
+        recorder = Recorder(files, RECORDING)
+        recorder.open_stream(SEEN)
+        for row in range(4):
+            about = "car-0" if row % 2 else None
+            recorder.record("seen", (float(row + 10 * number), about, float(row)))
+        recorder.close()
+        suffix = "" if number == 1 else f".{number}"
+        place = made.run.path / "agents" / name / f"seen{suffix}.jsonl"
+        (folder / "seen.jsonl").rename(place)
+    finish_run(made.run, made.result(), made.expected)
+    recorded = open_recorded_run(made.run, {})
+
+    series, _ = recorded.series(recorded.tables["seen"], "range_m")
+    (figure,) = field_lines(
+        recorded.tables["seen"], recorded, "range_m", title="range", y=Axis(unit="m")
+    )
+
+    told = {name: y.tolist() for name, (_, y) in series.items()}
+    assert told == {"agent-01": [0.0, 2.0] * 2, "agent-01 · car-0": [1.0, 3.0] * 2}
+    assert [mark.name for mark in figure.choices[0].marks] == list(told)
+    assert [np.isfinite(mark.y).sum() for mark in figure.choices[0].marks] == [4, 4]
