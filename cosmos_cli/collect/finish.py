@@ -30,7 +30,7 @@ from cosmos_cli.evidence.completeness import HOST, ExpectedRecords, find_missing
 from cosmos_cli.evidence.devices import expected_devices, read_devices, recorded_files
 from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
 from cosmos_cli.evidence.manifest import build_manifest, pack_run
-from cosmos_cli.evidence.remarks import declared_streams
+from cosmos_cli.evidence.remarks import declared_streams, undeclared_remarks
 from cosmos_cli.evidence.run_directory import RESERVE_BYTES, RunDirectory, write_json
 from cosmos_cli.evidence.run_documents import (
     MISSING,
@@ -270,7 +270,7 @@ def _evidence(
         missing=(*missing, *gathered.faults),
         expectations=judge_run(run, tables, planned_expectations(plan), end.result or {}),
         timeline_remarks=timeline_remarks(config, tables),
-        declared=declared_streams(plan),
+        undeclared_remarks=undeclared_remarks(declared_streams(plan), gathered.scans),
     )
 
 

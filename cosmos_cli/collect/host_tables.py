@@ -24,7 +24,8 @@ from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import RecordFile
 from cosmos_cli.evidence.table_labels import TableLabels
-from cosmos_cli.evidence.tables import TableLayout, TableWriter
+from cosmos_cli.evidence.table_layout import TableLayout
+from cosmos_cli.evidence.tables import TableWriter
 from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
 from madns_runtime import errors as runtime_errors
 from madns_runtime.analysis.field_checks import real_array

@@ -26,6 +26,7 @@ from cosmos_cli.evidence.streams import (
     find_streams,
     read_batches,
 )
+from cosmos_cli.evidence.table_layout import in_unit
 from cosmos_cli.evidence.tables import TableReader, open_tables
 from madns_runtime.errors import MachineError
 from madns_runtime.plain_values import mapping_at
@@ -91,13 +92,22 @@ class Recorded:
             MachineError: A file cannot be read.
         """
         wanted = list(names)
-        if self.reader is not None and self.reader.has(*wanted) and self._is_sound(self.reader):
-            yield from self.reader.batches(self.source, wanted, ROWS_READ_MAX, is_exact=True)
+        reader = self.reader
+        if reader is not None and self._is_held_by(reader, wanted) and self._is_sound(reader):
+            yield from reader.batches(self.source, wanted, ROWS_READ_MAX, is_exact=True)
             return
+        own = {field.name: field for field in self.fields}
         for file in self.files:
+            units = {field.name: field.unit for field in file.fields}
             for columns, count in read_batches(file, StreamReading(file.path)):
                 nothing = np.empty(count, dtype=object)  # of what another incarnation alone has
-                yield {name: columns.get(name, nothing) for name in wanted}
+                columns = {name: columns.get(name, nothing) for name in wanted}
+                yield {
+                    name: in_unit(values, units[name], own[name])[0]
+                    if name in units and name in own
+                    else values
+                    for name, values in columns.items()
+                }
 
     def lines(self) -> Lines | None:
         """
@@ -119,6 +129,16 @@ class Recorded:
             if self.collected.get(file.path, whole.hexdigest()) != whole.hexdigest():
                 changed.append(file.path)
         return Lines(sha256=digest.hexdigest(), records=records, changed=tuple(changed))
+
+    def _is_held_by(self, reader: TableReader, names: Sequence[str]) -> bool:
+        """Tell whether a table has columns of all these fields in their own units, not in those of other sources."""
+        if not reader.has(*names):
+            return False
+        units = {field.name: field.unit for field in reader.recorded_fields}
+        own = {field.name: field.unit for field in self.fields}
+        return not self.files or all(
+            own.get(name, unit) == unit for name, unit in units.items() if name in names
+        )
 
     def _is_sound(self, reader: TableReader) -> bool:
         """

@@ -14,6 +14,7 @@ from typing import Any
 from cosmos_cli.evidence.plugin_checks import check_fault, listed_checks
 from cosmos_cli.evidence.streams import StreamScan
 from cosmos_cli.evidence.verdict import is_number
+from cosmos_cli.models.declared_streams import AgentStreams, DeclaredStreams
 from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import from_mapping
@@ -30,9 +31,6 @@ REMARKS_MAX = 20
 QUEUE_MIB = LinkLimits().send_queue_bytes_max // 2**20
 """Room for what waits to be sent to one agent, MiB."""
 NOT_DECLARED = "not declared by the simulation's streams()"
-
-Declared = Mapping[tuple[str, str], DeclaredStream]
-"""Declared streams by role and name."""
 
 
 def result_remarks(
@@ -128,19 +126,23 @@ def _is_timed(entry: Mapping[str, Any]) -> bool:
     return is_number(entry.get("longest_s"))
 
 
-def declared_streams(plan: Mapping[str, Any] | None) -> Declared | None:
+def declared_streams(plan: Mapping[str, Any] | None) -> DeclaredStreams | None:
     """Return what plan.json keeps of a simulation's declaration; None if it has none."""
-    listed = (plan or {}).get("streams")
-    if not isinstance(listed, list):
+    listed, of_agents = (plan or {}).get("streams"), (plan or {}).get("agent_streams", [])
+    if not isinstance(listed, list) or not isinstance(of_agents, list):
         return None
     try:
-        found = [from_mapping(DeclaredStream, item) for item in listed]
+        return DeclaredStreams(
+            of_all=tuple(from_mapping(DeclaredStream, item) for item in listed),
+            of_agents=tuple(from_mapping(AgentStreams, item) for item in of_agents),
+        )
     except ConfigurationError:
         return None
-    return {(stream.role, stream.name): stream for stream in found}
 
 
-def undeclared_remarks(declared: Declared | None, scans: Sequence[StreamScan]) -> tuple[str, ...]:
+def undeclared_remarks(
+    declared: DeclaredStreams | None, scans: Sequence[StreamScan]
+) -> tuple[str, ...]:
     """
     Return a remark per fault, naming who recorded it; at most REMARKS_MAX, and how many more there are.
 
@@ -159,7 +161,8 @@ def undeclared_remarks(declared: Declared | None, scans: Sequence[StreamScan]) -
             or not file.fields
         ):
             continue
-        for fault in _faults(declared.get((file.role, file.stream)), file.fields):
+        known = declared.stream_of(file.role, file.stream, file.source)
+        for fault in _faults(known, file.fields):
             sources.setdefault(f"stream {file.stream}{fault}", []).append(file.source)
     remarks = [f"{_named(names)}: {fault}" for fault, names in sources.items()]
     more = len(remarks) - REMARKS_MAX

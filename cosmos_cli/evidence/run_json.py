@@ -22,7 +22,7 @@ from cosmos_cli.evidence.expectations.judge import JudgedExpectations
 from cosmos_cli.evidence.flown_files import KEY as FLOWN
 from cosmos_cli.evidence.flown_files import flown_remarks
 from cosmos_cli.evidence.plugin_checks import plugin_checks
-from cosmos_cli.evidence.remarks import Declared, result_remarks, undeclared_remarks
+from cosmos_cli.evidence.remarks import result_remarks
 from cosmos_cli.evidence.run_directory import SCHEMA
 from cosmos_cli.evidence.run_documents import Problem, text_or_none
 from cosmos_cli.evidence.statistics import TickStatistics, TickTotals, tick_totals, worst_sources
@@ -73,8 +73,7 @@ class Evidence:
     expectations: JudgedExpectations = JudgedExpectations()  # noqa: RUF009 - frozen
     """Results of what the scenario expected."""
     timeline_remarks: tuple[str, ...] = ()
-    declared: Declared | None = None
-    """Streams that the simulation declared; None if it declared none."""
+    undeclared_remarks: tuple[str, ...] = ()
 
     def judged(self) -> tuple[Verdict, dict[str, Any]]:
         """Return the verdict and run.json."""
@@ -183,7 +182,7 @@ class Evidence:
                 *time_zero_remarks(self.config, result, self.started.get("started_utc")),
                 *device_remarks(mapping_at(result, "agents"), self.devices),
                 *datagram_remarks(datagram_account(result)),
-                *undeclared_remarks(self.declared, self.scans),
+                *self.undeclared_remarks,
                 *flown_remarks(self.started),
                 *self.timeline_remarks,
                 *self.expectations.remarks(),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 
 from cosmos_cli.errors import InputError
@@ -60,10 +59,10 @@ def _find(root: Path, which: str) -> RunDirectory:
         if not _holds_run(Path(which)):
             raise InputError(f"{which}: no run directory: {EXPECTED}")
         return RunDirectory(Path(which).resolve())
-    listed = list_runs(root)
-    runs = [run for run in listed if _holds_run(run.path)]
-    found = runs[-1:] if which == "last" else [run for run in runs if _is_meant(run, which)]
+    runs = [run for run in list_runs(root) if _holds_run(run.path) or _is_packed(run)]
+    found = runs[-1:] if which == "last" else [run for run in runs if _is_named(run, which)]
     if len(found) == 1:
+        _refuse_packed(found[0])
         return found[0]
     if found:
         raise InputError(
@@ -80,7 +79,6 @@ def _find(root: Path, which: str) -> RunDirectory:
             raise InputError(
                 f"{which}: not in {root}, and several elsewhere; give the path: {', '.join(map(shlex.quote, paths))}"
             )
-    _refuse_packed(listed, which)
     _refuse_other(root, which)
     known = ", ".join(run.name for run in runs[-5:]) or "none yet"
     here = ""
@@ -109,21 +107,24 @@ def _holds_run(path: Path) -> bool:
     return is_planned or all(os.path.isdir(path / folder) for folder in FOLDERS)
 
 
-def _refuse_packed(listed: Sequence[RunDirectory], which: str) -> None:
-    """
-    See that the run that was named is not one of which only the package is left.
+def _is_packed(run: RunDirectory) -> bool:
+    """Tell whether only the package of a run is left."""
+    return run.bundle.is_file() and not os.path.lexists(run.path)
 
-    Args:
-        listed: All runs of the folder, by number.
-        which: The run that is not among those that have a folder.
+
+def _is_named(run: RunDirectory, which: str) -> bool:
+    """Tell whether a run is meant, a packed one by its package's name, too."""
+    return _is_meant(run, which.removesuffix(BUNDLE_SUFFIX) if _is_packed(run) else which)
+
+
+def _refuse_packed(run: RunDirectory) -> None:
+    """
+    See that a run has its folder still: another one of its number is not taken instead.
 
     Raises:
-        InputError: It is; the message says how it is unpacked.
+        InputError: Only its package is left; the message says how it is unpacked.
     """
-    packed = [run for run in listed if run.bundle.is_file() and not os.path.lexists(run.path)]
-    name = which.removesuffix(BUNDLE_SUFFIX)
-    meant = packed[-1:] if which == "last" else [run for run in packed if _is_meant(run, name)]
-    for run in meant:
+    if _is_packed(run):
         bundle, root = shlex.quote(str(run.bundle)), shlex.quote(str(run.path.parent))
         raise InputError(
             f"{run.name}: packed, its folder is gone; unpack it with: tar -xf {bundle} -C {root}"

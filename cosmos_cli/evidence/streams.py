@@ -36,8 +36,8 @@ DETAILS = Field(DETAILS_NAME, "", "json")
 Role = Literal["host", "agent", "machine", "device"]
 Kind = Literal["float", "int", "str", "bool", "json", "packed"]
 Columns = dict[str, NDArray[Any]]
-Consumer = Callable[[Columns, int], None]
-"""Takes a batch by columns and its number of records."""
+Consumer = Callable[[Columns, int, int], None]
+"""Takes a batch by columns, its number of records, and of how many bytes of the file it was read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,7 +197,7 @@ def scan_stream(file: RecordFile, consume: Consumer | None = None) -> StreamScan
 
     Args:
         file: The stream.
-        consume: Called with each batch of records.
+        consume: Called with each batch of records, one block of the file.
 
     Raises:
         MachineError: The file cannot be read.
@@ -206,9 +206,11 @@ def scan_stream(file: RecordFile, consume: Consumer | None = None) -> StreamScan
     reading = StreamReading(file.path, hashed.take)
     try:
         if file.fields:
+            passed_bytes = 0
             for columns, count in read_batches(file, reading):
                 if consume is not None:
-                    consume(columns, count)
+                    consume(columns, count, hashed.size_bytes - passed_bytes)
+                passed_bytes = hashed.size_bytes
         state = reading.state
     except OSError as error:
         raise MachineError(f"{file.path}: cannot be read: {error.strerror}") from error

@@ -12,8 +12,7 @@ import json
 import os
 import shlex
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from numpy.typing import NDArray
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.arrow_values import (
-    ARROW_TYPES,
     as_floats,
     floats_array,
     numbers_array,
@@ -35,8 +33,9 @@ from cosmos_cli.evidence.arrow_values import (
     to_times,
 )
 from cosmos_cli.evidence.run_directory import RunDirectory
-from cosmos_cli.evidence.streams import DETAILS, NUMBER_KINDS, Columns, RecordFile
-from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
+from cosmos_cli.evidence.streams import Columns, RecordFile
+from cosmos_cli.evidence.table_labels import NEVER_US
+from cosmos_cli.evidence.table_layout import METADATA_KEY, TableLayout, in_unit
 from madns_runtime.analysis.tables import AGENT, INCARNATION, RecordedRun
 from madns_runtime.conditions.condition import TIME
 from madns_runtime.partial_file import create_partial
@@ -44,97 +43,9 @@ from madns_runtime.recording.columns import joined_column
 from madns_runtime.recording.records import Field
 
 ROWS_PER_GROUP = 128 * 1024
-SIMULATED_UTC = "simulated_utc"
-METADATA_KEY = b"cosmos"
-NO_LABELS = TableLabels()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TableLayout:
-    """The columns of one table: fields over all its streams, and what is added to them."""
-
-    name: str
-    role: str
-    source_column: str
-    fields: tuple[Field, ...]
-    tick_hz: float | None
-    """Rate from which t_s is made of the field tick; None where there is nothing to make."""
-    labels: TableLabels = NO_LABELS
-    """Columns that are added to each record."""
-
-    @property
-    def _names(self) -> set[str]:
-        return {field.name for field in self.fields}
-
-    @property
-    def has_utc(self) -> bool:
-        """Whether each record's simulated time is told as UTC, too."""
-        has_time = self.tick_hz is not None or TIME in self._names
-        return has_time and self.labels.zero_utc is not None and SIMULATED_UTC not in self._names
-
-    @property
-    def label(self) -> str | None:
-        """Name of the column with the second name of each record's agent; None if there is none."""
-        is_of_agents = self.role == "agent" or AGENT in self._names
-        labels = self.labels.agents
-        is_free = labels.column not in (*self._names, self.source_column)
-        return labels.column if is_of_agents and labels.names and is_free else None
-
-    def arrow_schema(self) -> pa.Schema:
-        """Return the table's schema; each field knows its unit."""
-        columns = [
-            pa.field(self.source_column, pa.dictionary(pa.int32(), pa.string())),
-            pa.field(INCARNATION, pa.int32()),
-        ]
-        if self.tick_hz is not None:
-            columns.append(pa.field(TIME, pa.float64(), metadata={"unit": "s"}))
-        if self.has_utc:
-            columns.append(pa.field(SIMULATED_UTC, pa.timestamp("us", tz="UTC")))
-        if self.label:
-            columns.append(pa.field(self.label, pa.dictionary(pa.int32(), pa.string())))
-        for field in self.fields:
-            about = {"unit": field.unit, "kind": field.kind}
-            columns.append(pa.field(field.name, ARROW_TYPES[field.kind], metadata=about))
-        note = {
-            "table": self.name,
-            "role": self.role,
-            "source_column": self.source_column,
-            "labels": [
-                *([SIMULATED_UTC] if self.has_utc else []),
-                *([self.label] if self.label else []),
-            ],
-        }
-        return pa.schema(columns, metadata={METADATA_KEY: json.dumps(note).encode()})
-
-
-def plan_table(
-    files: Sequence[RecordFile], tick_hz: float | None, labels: TableLabels = NO_LABELS
-) -> TableLayout:
-    """
-    Return the layout that holds every record of *files*, which are of one table.
-
-    Where incarnations or agents disagree on a field's kind, the wider one holds both: a float holds an
-    int, and text holds anything. Packed fields have no column: only their simulation reads them.
-    """
-    merged: dict[str, Field] = {}
-    for file in files:
-        for field in (*file.fields, *(() if file.is_array else (DETAILS,))):
-            known = merged.get(field.name)
-            merged[field.name] = field if known is None else _wider(known, field)
-    role = files[0].role
-    has_tick = "tick" in merged and merged["tick"].kind in NUMBER_KINDS
-    needs_time = has_tick and "t_s" not in merged and role == "agent"
-    source_column: str = role
-    while source_column in merged:
-        source_column += "_name"
-    return TableLayout(
-        name=files[0].table,
-        role=role,
-        source_column=source_column,
-        fields=tuple(f for f in merged.values() if f.name != INCARNATION and f.kind != "packed"),
-        tick_hz=tick_hz if needs_time else None,
-        labels=labels,
-    )
+BYTES_PER_GROUP = 32 << 20
+"""Of the lines that a row group is made of: records of more than 256 bytes each make smaller ones. As values of Python
+and of Arrow they need about four times as much memory."""
 
 
 class TableWriter:
@@ -153,11 +64,14 @@ class TableWriter:
         self.path = path
         self.unfit = 0
         """Values that do not fit their field's kind and are null here."""
+        self.foreign: dict[str, int] = {}
+        """Values in a unit that does not convert to their column's and that are null here, by a word on whose they are."""
         self.rows = 0
         self._layout = layout
         self._schema = layout.arrow_schema()
         self._held: list[Columns] = []
         self._held_count = 0
+        self._held_bytes = 0
         path.parent.mkdir(parents=True, exist_ok=True)
         # Made before pyarrow opens it by its name: a link that lies there is not followed.
         self._partial, descriptor = create_partial(path, takes_over=True)
@@ -168,11 +82,20 @@ class TableWriter:
             self._partial.unlink(missing_ok=True)  # a full disk takes a file, but nothing in it
             raise
 
-    def add(self, file: RecordFile, columns: Columns, count: int) -> None:
-        """Take a batch of a file's records; a file's batches come one after the other."""
+    def add(self, file: RecordFile, columns: Columns, count: int, size_bytes: int = 0) -> None:
+        """
+        Take a batch of a file's records; a file's batches come one after the other.
+
+        Args:
+            file: Of the records.
+            columns: The batch.
+            count: Number of its records.
+            size_bytes: As lines; 0 where they are numbers alone, which take little.
+        """
         self._held.append(columns)
         self._held_count += count
-        if self._held_count >= ROWS_PER_GROUP:
+        self._held_bytes += size_bytes
+        if self._held_count >= ROWS_PER_GROUP or self._held_bytes >= BYTES_PER_GROUP:
             self.end_file(file)
 
     def end_file(self, file: RecordFile) -> None:
@@ -180,7 +103,7 @@ class TableWriter:
         if self._held_count:
             self._writer.write_table(self._table(file), row_group_size=ROWS_PER_GROUP)
             self.rows += self._held_count
-        self._held, self._held_count = [], 0
+        self._held, self._held_count, self._held_bytes = [], 0, 0
 
     def close(self) -> None:
         """Finish the file and give it its name."""
@@ -198,10 +121,7 @@ class TableWriter:
         count, layout = self._held_count, self._layout
         incarnation = np.full(count, file.incarnation, np.int32)
         arrays: list[Any] = [one_code(file.source, count), numbers_array(incarnation)]
-        joined = {
-            field.name: _join([batch.get(field.name) for batch in self._held], count)
-            for field in layout.fields
-        }
+        joined = {field.name: self._column(file, field, count) for field in layout.fields}
         t_s = joined.get(TIME)
         if layout.tick_hz is not None:
             t_s = as_floats(joined["tick"]) / layout.tick_hz
@@ -215,6 +135,16 @@ class TableWriter:
             arrays.append(array)
             self.unfit += unfit
         return pa.Table.from_arrays(arrays, schema=self._schema)
+
+    def _column(self, file: RecordFile, field: Field, count: int) -> NDArray[Any]:
+        """Return what is held of a field, in its column's unit."""
+        values = _join([batch.get(field.name) for batch in self._held], count)
+        unit = next((own.unit for own in file.fields if own.name == field.name), field.unit)
+        values, lost = in_unit(values, unit, field)
+        if lost:
+            told = f"{field.name} of {file.source} is in {unit or '1'}, the table's in {field.unit or '1'}"
+            self.foreign[told] = self.foreign.get(told, 0) + lost
+        return values
 
     def _labels(
         self, file: RecordFile, agents: NDArray[Any] | None, count: int
@@ -375,13 +305,6 @@ def _open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
         column_encoding=encodings,
         write_page_checksum=True,
     )
-
-
-def _wider(first: Field, second: Field) -> Field:
-    if first.kind == second.kind:
-        return first
-    kinds = {first.kind, second.kind}
-    return Field(first.name, first.unit, "float" if kinds == {"int", "float"} else "json")
 
 
 def _field(column: pa.Field) -> Field:

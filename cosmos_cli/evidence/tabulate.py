@@ -23,13 +23,16 @@ from cosmos_cli.evidence.streams import (
     scan_stream,
 )
 from cosmos_cli.evidence.table_labels import TableLabels
-from cosmos_cli.evidence.tables import NO_LABELS, TableLayout, TableWriter, plan_table
+from cosmos_cli.evidence.table_layout import NO_LABELS, TableLayout, plan_table
+from cosmos_cli.evidence.tables import TableWriter
 from madns_runtime.errors import MachineError
 
 Progress = Callable[[str, float], None]
 """Takes what is being done and how far it is, 0 to 1."""
 Layout = Callable[[Sequence[RecordFile]], TableLayout]
 """Lays out the table of some streams."""
+FOREIGN_TOLD_MAX = 3
+"""Fields of agents in units that do not convert, each told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,10 +127,10 @@ class _Table:
             if readable:
                 self._writer = TableWriter(path, layout(readable))
 
-    def add(self, file: RecordFile, columns: Columns, count: int) -> None:
+    def add(self, file: RecordFile, columns: Columns, count: int, size_bytes: int) -> None:
         with self._guarded():
             if self._writer is not None:
-                self._writer.add(file, columns, count)
+                self._writer.add(file, columns, count, size_bytes)
 
     def end_file(self, file: RecordFile) -> None:
         with self._guarded():
@@ -138,9 +141,8 @@ class _Table:
         with self._guarded():
             if self._writer is not None:
                 self._writer.close()
-        if self._writer is not None and self._writer.unfit:
-            told = "recorded values are not of their field's kind and are null"
-            self.fault = f"{self._writer.unfit} {told}"
+        if self._writer is not None:
+            self.fault = _lost(self._writer)
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
@@ -153,3 +155,13 @@ class _Table:
             if self._writer is not None:
                 self._writer.abandon()
             self._writer = None
+
+
+def _lost(writer: TableWriter) -> str | None:
+    """Return which recorded values a table does not hold; None if it holds all."""
+    unfit = "recorded values are not of their field's kind and are null"
+    told = [f"{writer.unfit} {unfit}"] if writer.unfit else []
+    foreign = [f"{place}: {number} values are null" for place, number in writer.foreign.items()]
+    if (more := len(foreign) - FOREIGN_TOLD_MAX) > 0:
+        foreign[FOREIGN_TOLD_MAX:] = [f"so are those of {more} more"]
+    return "; ".join([*told, *foreign]) or None

@@ -246,6 +246,8 @@ def _declared(scenario: ScenarioFile) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if scenario.streams is not None:
         found["streams"] = [to_mapping(stream) for stream in scenario.streams]
+    if scenario.agent_streams:
+        found["agent_streams"] = [to_mapping(each) for each in scenario.agent_streams]
     if scenario.expectations:
         found[EXPECTATIONS] = to_mapping({"": scenario.expectations})[""]
     if scenario.labels.names:

@@ -160,6 +160,8 @@ class _Placing:
             yield ("stream",), fault
             return
         yield from self._apart_faults() if self._is_apart else self._agent_faults()
+        if rule.stop_when_broken and (fault := streams.apart_fault(self._stream, self._field)):
+            yield ("stop_when_broken",), fault
         if not streams.has_time(self._stream):
             yield from self._timeless_faults()
         if self._field and (fault := streams.field_fault(self._stream, self._field)):
@@ -236,8 +238,6 @@ class _Placing:
                 yield path, f"no agent is named {pattern}{did_you_mean(pattern, around.agents)}"
             elif not self._devices([pattern]):
                 yield path, f"{pattern} does not use what records {stream}: {named_agents(sources)}"
-        if self._rule.stop_when_broken:
-            yield ("stop_when_broken",), around.streams.apart_fault(stream) or ""
 
     def _devices(self, patterns: Sequence[str]) -> tuple[str, ...]:
         """Return the full names of the devices of some agents that record the stream."""
@@ -328,14 +328,17 @@ class _Placing:
             is_of_host=is_of_host,
             statistic=rule.kind,
             bounds=ValueBounds() if rule.event is not None else rule.bounds(),
-            unit=rule.unit,
+            unit=around.streams.bounds_unit(self._stream, self._field, rule.unit),
             when=None if rule.when is None else rule.when.bounds(),
             from_s=rule.from_s,
             to_s=_earliest(rule.to_s, rule.before_s),
             meanwhile=None
             if held is None
             else HeldBounds(
-                stream=held.stream, field=held.field, bounds=held.bounds(), unit=held.unit
+                stream=held.stream,
+                field=held.field,
+                bounds=held.bounds(),
+                unit=around.streams.bounds_unit(held.stream, held.field, held.unit),
             ),
             event=rule.event or "",
             has_known_words=bool(around.streams.words(self._stream, self._field)),

@@ -30,6 +30,7 @@ from madns_runtime.recording.records import (
 REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS, HEALTH))
 """Framework streams that no run in lockstep records: no time passes there that could be late."""
 NOT_A_VALUE = ("json", "packed")
+NUMBER_KINDS = ("float", "int")
 OF_DEVICES_OWN = (DEVICE_STATE, DEVICE_CLOCK, EVENTS, LOG)
 """Streams of a device beside its channels: how it fares, not what it measures."""
 INPUT_HEAD = tuple(field.name for field in schema_of(Channel(name="any")).fields[:-1])
@@ -249,8 +250,28 @@ class KnownStreams:
         """Tell whether a stream is recorded in processes of machines or devices alone."""
         return self.roles(stream) <= set(APART)
 
-    def apart_fault(self, stream: str) -> str | None:
+    def bounds_unit(self, stream: str, field: str, given: str) -> str:
+        """
+        Return the unit that bounds of a field are in: the one that is *given*, or else its own, "".
+
+        Where not all record it in one unit, bounds without any are in the unit that was declared first.
+        """
+        units = self._units(stream, field)
+        return given or (units[0] if len(units) > 1 else "")
+
+    def _units(self, stream: str, field: str) -> list[str]:
+        """Return the units in which numbers of a field are recorded, the one that was declared first before others."""
+        found = (each for on in self.of(stream) for each in on.fields if each.name == field)
+        return list(dict.fromkeys(each.unit for each in found if each.kind in NUMBER_KINDS))
+
+    def apart_fault(self, stream: str, field: str = "") -> str | None:
         """Return why nothing can wait for a value of a stream in the run; None if it can."""
+        units = self._units(stream, field)
+        if len(units) > 1:
+            return (
+                f"stream {stream} has {field} in {' and in '.join(each or '1' for each in units)}, by who records it,"
+                " so nothing acts on it in the run"
+            )
         if not self.is_apart(stream):
             return None
         whose = "a machine" if self.roles(stream) == {"machine"} else "a device"

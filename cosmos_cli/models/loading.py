@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.checks import scenario_checks, unjudged_remark
+from cosmos_cli.models.declared_streams import AgentStreams, every_stream
 from cosmos_cli.models.document import Document, dotted, read_document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.executor_answer import EXECUTOR_KIND, ask_executor
@@ -70,6 +71,8 @@ class ScenarioFile:
     """Whether the simulation tells what it asks of host and network."""
     streams: tuple[DeclaredStream, ...] | None = None
     """Streams that the simulation declares; None if it declares none."""
+    agent_streams: tuple[AgentStreams, ...] = ()
+    """Streams of agents for which it declares others."""
     labels: AgentLabels = NO_LABELS
     """Second names of the agents."""
     place_uses: tuple[PlaceUse, ...] = ()
@@ -247,7 +250,8 @@ def _check(
     wrong, odd = ("", "") if broken else ask_executor(scenario)
     faults += [document.fault(EXECUTOR_KIND, wrong)] if wrong else []
     remarks = (*answers.remarks, *([document.fault(EXECUTOR_KIND, odd)] if odd else []))
-    streams = KnownStreams(answers.streams, devices)
+    declared = answers.streams and every_stream(answers.streams, answers.agent_streams)
+    streams = KnownStreams(declared, devices)
     timeline = NO_TIMELINE
     if not broken - {"timeline"}:
         timeline = resolve_timeline(document, scenario, answers.actions, answers.labels, streams)
@@ -271,6 +275,7 @@ def _check(
         agent_parameters=answers.agent_parameters,
         has_demand=answers.has_demand,
         streams=answers.streams,
+        agent_streams=answers.agent_streams,
         labels=answers.labels or NO_LABELS,
         place_uses=answers.place_uses,
         timeline=timeline,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from cosmos_cli.models.declared_streams import AgentStreams
 from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.plugin.api import DeclaredStream, DeviceUse, PlaceUse
 
@@ -35,6 +36,11 @@ def of_all_agents(own: ParameterAnswers, rules: Sequence[ParameterAnswers]) -> d
             AgentParameters(agents=rule.agents, parameters=rule.parameters) for rule in rules
         ),
         "streams": streams,
+        "agent_streams": tuple(
+            AgentStreams(agents=rule.agents, streams=rule.streams)
+            for rule in rules
+            if rule.streams is not None and rule.streams != own.streams
+        ),
         "device_uses": (
             *(use for use in own.device_uses if use.agent not in ruled),
             *(use for rule in rules for use in rule.device_uses if use.agent in rule.agents),

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.agent_rules import RULES, refused_parameters, rule_document, select_agents
+from cosmos_cli.models.declared_streams import AgentStreams, every_stream
 from cosmos_cli.models.document import Document
 from cosmos_cli.models.fault_place import fault_found_at
 from cosmos_cli.models.parameter_answers import ParameterAnswers, of_all_agents
@@ -73,6 +74,8 @@ class PluginAnswers:
     """Whole parameters of agents for which others hold."""
     streams: tuple[DeclaredStream, ...] | None = None
     """Streams as it declares them; None if it declares none, or nobody could be asked."""
+    agent_streams: tuple[AgentStreams, ...] = ()
+    """Streams of agents for which it declares others."""
     labels: AgentLabels | None = None
     """Second names of agents; None if the simulation could not be asked for those it gives."""
     device_uses: tuple[DeviceUse, ...] = ()
@@ -155,8 +158,12 @@ class _Asking:
             found = replace(found, labels=self._labels(simulation, parameters, self._agents))
             rules = self._rules(simulation, self._agents, found, duration_s)
             found = replace(found, **of_all_agents(own, rules))
+            streams = every_stream(found.streams or (), found.agent_streams)
+            # What could not be asked is told already.
+            if simulation.streams is None or None not in [each.streams for each in (own, *rules)]:
+                self._blame(*unknown_columns(simulation.columns, streams))
             if simulation.labels is not None:
-                taken = label_column_remarks(simulation.label_column, found.streams or ())
+                taken = dict.fromkeys(label_column_remarks(simulation.label_column, streams))
                 self._remarks += [self._document.fault(("simulation",), text) for text in taken]
             self._check_actions(simulation, parameters, own_actions, found.labels)
         return self._told(found)
@@ -344,8 +351,6 @@ class _Asking:
                 )
             except PluginError as error:
                 self._blame(str(error))
-                return None
-        self._blame(*unknown_columns(simulation.columns, found or ()))
         return found
 
     def _labels(

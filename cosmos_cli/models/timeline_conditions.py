@@ -37,7 +37,7 @@ class AwaitedCondition:
         if fault := streams.stream_fault(rule.stream):
             yield ("stream",), fault
             return
-        if fault := streams.apart_fault(rule.stream):
+        if fault := streams.apart_fault(rule.stream, rule.field):
             yield ("stream",), fault
             return
         if self.is_lockstep and rule.stream in REAL_TIME_ONLY:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from cosmos_cli.evidence.expectations.of_run import planned_expectations
@@ -11,7 +11,7 @@ from cosmos_cli.evidence.verdict import is_number
 from cosmos_cli.models.expectation import Expectation, scaled
 from cosmos_cli.report.cells import format_measured
 from madns_runtime.analysis.lines import grouped_lines
-from madns_runtime.analysis.tables import RecordedRun, RecordedTable
+from madns_runtime.analysis.tables import OF_OTHER, RecordedRun, RecordedTable
 from madns_runtime.analysis.values import (
     Axis,
     Block,
@@ -107,7 +107,9 @@ def _figure(
     series, x = recorded.series(table, field.name)
     worst = str(result.get(AGENT))
     names = expectation.agents or table.sources
-    named = [name for name in (worst, *(n for n in names if n != worst)) if name in series]
+    named = list(
+        dict.fromkeys(key for name in (worst, *names) for key in _lines_of(name, series, table))
+    )
     few = f"The first {AGENTS_DRAWN_MAX} of {len(named)}, the one that is told before the others."
     return grouped_lines(
         {name: series[name] for name in named[:AGENTS_DRAWN_MAX]},
@@ -116,8 +118,15 @@ def _figure(
         y=Axis(unit=field.unit),
         note=few if len(named) > AGENTS_DRAWN_MAX else "",
         limits=_limits(expectation, field.unit),
-        returns={name: recorded.returns(table, name) for name in series if name in table.sources},
+        returns=recorded.series_returns(table, series),
     )
+
+
+def _lines_of(name: str, series: Iterable[str], table: RecordedTable) -> list[str]:
+    """Return the lines of one who is judged: its own, or one for each other that its records are about."""
+    if name == table.role == HOST:
+        return list(series)
+    return [key for key in series if key == name or key.startswith(f"{name}{OF_OTHER}")]
 
 
 def _limits(expectation: Expectation, unit: str) -> list[LimitLine]:

@@ -200,7 +200,8 @@ def encode_array(values: NDArray[Any]) -> dict[str, str]:
         finite = wide[np.isfinite(wide)]
         spread = float(np.ptp(finite)) if finite.size else 0.0
         error = float(np.abs(finite - finite.astype("<f4")).max()) if finite.size else 0.0
-    is_fine = error <= RESOLUTION * spread
+    # A spread that is no float itself allows no error: all that is too large for 4 bytes would become infinite.
+    is_fine = error <= RESOLUTION * spread < np.inf
     chosen: NDArray[Any] = narrow if is_fine else wide
     return {
         "dtype": "f4" if is_fine else "f8",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from madns_runtime.analysis.breaks import NOWHERE
-from madns_runtime.analysis.sampling import drawn_series, points_per_series
+from madns_runtime.analysis.sampling import SERIES_PER_FIGURE, drawn_series, points_per_series
 from madns_runtime.analysis.tables import AGENT, RecordedRun, RecordedTable
 from madns_runtime.analysis.values import (
     SIMULATED_TIME,
@@ -51,12 +51,12 @@ def grouped_lines(  # noqa: PLR0913 - what is drawn and how it is lettered; all 
     returns: Mapping[str, NDArray[np.int64]] | None = None,
 ) -> list[Block]:
     """
-    Return one figure of a quantity of many, thinned; a remark if there is not a single value.
+    Return one figure of a quantity of many, thinned; a remark if there is not a single value, or on those left out.
 
     No line goes through a gap in samples that else come regularly, nor over an angle's wrap.
 
     Args:
-        series: Abscissae and ordinates by whose they are.
+        series: Abscissae and ordinates by whose they are; the first SERIES_PER_FIGURE are drawn.
         title: The figure's.
         y: The ordinate.
         x: The abscissa.
@@ -66,10 +66,11 @@ def grouped_lines(  # noqa: PLR0913 - what is drawn and how it is lettered; all 
         limits: What should not be passed.
         returns: Numbers of the samples before which the line is broken, by whose they are.
     """
-    points = points_per_series(len(series))
+    drawn = tuple(series)[:SERIES_PER_FIGURE]
+    points = points_per_series(len(drawn))
     choices = []
     starts = returns or {}
-    for label, names in groups_of_agents(tuple(series)):
+    for label, names in groups_of_agents(drawn):
         marks = [
             drawn_series(
                 Series(x=series[name][0], y=series[name][1], name=name, form=form),
@@ -82,9 +83,14 @@ def grouped_lines(  # noqa: PLR0913 - what is drawn and how it is lettered; all 
         ]
         if marks:
             choices.append(FigureChoice(name=label, marks=marks))
+    left_out = []
+    if (more := len(series) - len(drawn)) > 0:
+        text = f"{title}: {more} of {len(series)} are not drawn, those behind {drawn[-1]}."
+        left_out = [ReportRemark(text=text)]
     if not choices:
-        return [ReportRemark(text=f"{title}: not a single value was recorded.")]
-    return [Figure(title=title, note=note, x=x, y=y, choices=choices, group=group, limits=limits)]
+        return [ReportRemark(text=f"{title}: not a single value was recorded."), *left_out]
+    figure = Figure(title=title, note=note, x=x, y=y, choices=choices, group=group, limits=limits)
+    return [figure, *left_out]
 
 
 def field_lines(  # noqa: PLR0913 - a field, and how it is lettered
@@ -118,7 +124,7 @@ def field_lines(  # noqa: PLR0913 - a field, and how it is lettered
         y=y,
         note=note,
         group="agents" if is_of_agents else table.role,
-        returns={who: run.returns(table, who) for who in series if who in table.sources},
+        returns=run.series_returns(table, series),
     )
 
 

@@ -19,6 +19,8 @@ QUANTILES = (0.5, 0.99)
 POINTS_PER_FIGURE = 40_000
 POINTS_PER_SERIES_MAX = 1500
 POINTS_PER_SERIES_MIN = 60
+SERIES_PER_FIGURE = POINTS_PER_FIGURE // POINTS_PER_SERIES_MIN
+"""More would have fewer points each than tell anything, or make a page that no browser shows."""
 POINTS_PER_WRAP = 6
 """With fewer to each turn of an angle its lines are no more than strokes: points tell more."""
 RMS_BINS = 12

@@ -22,6 +22,8 @@ from madns_runtime.recording.records import Field
 
 AGENT = "agent"
 INCARNATION = "incarnation"
+OF_OTHER: Final = " · "
+"""In a line's name, between an agent that recorded it and the other one that it is about."""
 HOST_EVENTS: Final = "host_events"
 SHUTDOWN_STATES: Final = ("BEGIN_SHUTDOWN", "EMERGENCY_SHUTDOWN")
 Columns = Mapping[str, NDArray[Any]]
@@ -183,20 +185,24 @@ class RecordedRun:
         """
         Return one field over time, abscissae and ordinates, by whose it is; and what the abscissae are.
 
-        A stream with a text column `agent`, as a host records of all its agents, is one series per agent.
+        A stream with a text column `agent`, as a host records of all its agents, is one series per agent; records
+        about none are whose they are.
         """
         found: dict[str, tuple[Floats, Floats]] = {}
         axis = Axis()
         for source in table.sources:
             x, axis = self.time_of(table, source)
             y = self.values(table, source, name)
-            if not any(field.name == AGENT and field.kind == "str" for field in table.fields):
+            if not _names_agents(table):
                 found[source] = (x, y)
                 continue
-            agents = table.read(source, (AGENT,))[AGENT].astype(str)
-            for agent in dict.fromkeys(agents.tolist()):
-                rows = np.flatnonzero(agents == agent)
-                label = f"{source} · {agent}" if table.role == AGENT else agent
+            rows_of: dict[str, list[int]] = {}
+            for row, agent in enumerate(table.read(source, (AGENT,))[AGENT].tolist()):
+                whole = source if agent is None else str(agent)
+                is_of_other = agent is not None and table.role == AGENT
+                label = f"{source}{OF_OTHER}{agent}" if is_of_other else whole
+                rows_of.setdefault(label, []).append(row)
+            for label, rows in rows_of.items():
                 found[label] = (x[rows], y[rows])
         return found, axis
 
@@ -207,9 +213,21 @@ class RecordedRun:
         incarnations = as_array(table.read(source, (INCARNATION,))[INCARNATION])
         return np.flatnonzero(np.diff(incarnations)) + 1
 
+    def series_returns(
+        self, table: RecordedTable, names: Iterable[str]
+    ) -> dict[str, NDArray[np.int64]]:
+        """Return the same by series, of those that hold all records of a source."""
+        whole = () if _names_agents(table) else table.sources
+        return {name: self.returns(table, name) for name in names if name in whole}
+
     def values(self, table: RecordedTable, source: str, name: str) -> Floats:
         """Return one field of a source as floats, null as NaN."""
         return as_array(table.read(source, (name,))[name])
+
+
+def _names_agents(table: RecordedTable) -> bool:
+    """Tell whether each record of a table says which agent it is about."""
+    return any(field.name == AGENT and field.kind == "str" for field in table.fields)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

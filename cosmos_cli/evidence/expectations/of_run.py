@@ -120,7 +120,7 @@ def expectations_for(
     if not scenario.scenario.checks:
         raise InputError(f"{scenario.path}: has no checks: nothing can be judged by it")
     declared = declared_streams(run.read_json(run.plan_json))
-    streams = recorded_streams(tables) if declared is None else tuple(declared.values())
+    streams = recorded_streams(tables) if declared is None else declared.every()
     around = Surroundings(
         agents=config.agents.resolved_names(),
         labels=run_labels(run),

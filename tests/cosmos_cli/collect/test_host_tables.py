@@ -16,7 +16,7 @@ from cosmos_cli.collect.host_tables import (
 )
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
-from cosmos_cli.evidence.tables import NO_LABELS
+from cosmos_cli.evidence.table_layout import NO_LABELS
 from madns_runtime.config import Agents, RunConfig, Timeouts
 from madns_runtime.errors import PluginError
 

@@ -527,3 +527,23 @@ def test_records_about_others_are_no_pairs_though_their_words_are_the_same_in_a_
     assert code == 1
     assert (calls["matched"], calls["only_a"]["count"], calls["only_b"]["count"]) == (0, 1, 1)
     assert calls["only_a"]["first"]["who"] == "agent-01 " + " ".join(filter(None, a))
+
+
+def test_a_stream_whose_table_is_in_another_unit_is_compared_in_its_own(make, capsys):
+    def in_units(made, by=0.0):
+        for agent, unit in (("agent-01", "m"), ("agent-02", "km")):
+            schema = StreamSchema("radar", (Field("t_s", "s"), Field("range_", unit)))
+            recorder = made.recorder(f"agents/{agent}", agent, schema)
+            recorder.record("radar", (0.0, 1.0 + by))
+            recorder.close()
+
+    make(in_units), make(lambda made: in_units(made, by=2.0))
+
+    _, document = diff(capsys, "1", "2")
+
+    sources = streams_of(document)["radar"]["sources"]
+    found = {name: source["fields"]["range_"] for name, source in sources.items()}
+    assert {name: (each["unit"], each["max"]) for name, each in found.items()} == {
+        "agent-01": ("m", 2.0),
+        "agent-02": ("km", 2.0),
+    }

@@ -93,3 +93,37 @@ def test_damaged_entry_and_unwritable_index_do_no_harm(tmp_path: Path) -> None:
     remember_run("0002-y", tmp_path)
 
     assert remembered_runs() == []
+
+
+def leave_package_alone(root: Path, name: str) -> None:
+    run = create_run(root, name)
+    shutil.rmtree(run.path)
+    run.bundle.write_bytes(b"")
+
+
+@pytest.mark.parametrize("which", ["1", "0001-x", "0001-x.tar.zst", "last"])
+def test_packed_run_here_is_not_passed_over_for_one_elsewhere(tmp_path: Path, which: str) -> None:
+    create_run(tmp_path / "runs", "x")
+    leave_package_alone(Path("runs"), "x")
+
+    with pytest.raises(InputError, match="0001-x: packed, its folder is gone; unpack it with"):
+        find_run(Path("runs"), which)
+
+
+def test_last_run_that_is_packed_is_not_passed_over_for_an_older_one() -> None:
+    older = create_run(Path("runs"), "x")
+    leave_package_alone(Path("runs"), "y")
+
+    with pytest.raises(InputError, match="0002-y: packed"):
+        find_run(Path("runs"), "last")
+    assert find_run(Path("runs"), "1") == older
+
+
+def test_number_that_a_packed_run_shares_asks_for_the_full_name() -> None:
+    whole = create_run(Path("runs"), "x")
+    leave_package_alone(Path("runs"), "y")
+    Path("runs/0002-y.tar.zst").rename("runs/0001-y.tar.zst")
+
+    with pytest.raises(InputError, match="0001-x, 0001-y match"):
+        find_run(Path("runs"), "1")
+    assert find_run(Path("runs"), "0001-x") == whole

@@ -17,7 +17,8 @@ from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import write_json
 from cosmos_cli.evidence.streams import find_streams, open_stream_file, scan_stream
 from cosmos_cli.evidence.table_labels import NEVER_US, TableLabels
-from cosmos_cli.evidence.tables import TableReader, TableWriter, no_tables, open_tables, plan_table
+from cosmos_cli.evidence.table_layout import plan_table
+from cosmos_cli.evidence.tables import TableReader, TableWriter, no_tables, open_tables
 from cosmos_cli.evidence.tabulate import gather
 from cosmos_cli.models.agent_labels import AgentLabels
 from madns_runtime.errors import MachineError
@@ -274,6 +275,62 @@ def test_incarnations_with_other_fields_share_a_table(tmp_path):
     assert table["incarnation"] == [1, 2]
 
 
+def with_range(unit, kind="float"):
+    return StreamSchema("radar", (Field("t_s", "s"), Field("range_", unit, kind)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit", "recorded", "expected"),
+    [
+        ("float", "km", [1.005, None, -2.0], [1005.0, None, -2000.0]),
+        ("float", "km", [1e307], [None]),  # more than a float of m can be
+        ("int", "km", [3, 4], [3000.0, 4000.0]),
+        ("int", "mm", [3, None], [0.003, None]),
+    ],
+)
+def test_numbers_in_another_unit_are_converted_to_that_of_their_column(
+    tmp_path, kind, unit, recorded, expected
+):
+    made = SyntheticRun(tmp_path)
+    record(made, "agent-01", with_range("m", kind), [(0.0, 7)])
+    record(made, "agent-02", with_range(unit, kind), list(enumerate(recorded)))
+
+    gathered = gather(made.run, 10.0, quiet)
+
+    table = TableReader(made.run.tables / "radar.parquet")
+    assert table.fields[1] == Field("range_", "m")
+    assert table.read("agent-01", ("range_",))["range_"].tolist() == [7.0]
+    values = table.read("agent-02", ("range_",))["range_"]
+    assert [None if np.isnan(value) else value for value in values] == expected
+    assert bool(gathered.faults) == (recorded == [1e307])
+
+
+def test_numbers_that_measure_something_else_are_null_and_a_fault_of_the_table(tmp_path):
+    made = SyntheticRun(tmp_path)
+    record(made, "agent-01", with_range("m"), [(0.0, 7.0)])
+    record(made, "agent-02", with_range("kg"), [(0.0, 1.0), (1.0, None), (2.0, 3.0)])
+
+    gathered = gather(made.run, 10.0, quiet)
+
+    assert gathered.faults == (
+        "tables/radar.parquet: range_ of agent-02 is in kg, the table's in m: 2 values are null",
+    )
+    table = TableReader(made.run.tables / "radar.parquet")
+    assert table.read("agent-01", ("range_",))["range_"].tolist() == [7.0]
+    assert np.isnan(table.read("agent-02", ("range_",))["range_"]).all()
+
+
+def test_a_column_of_text_from_different_units_has_none(tmp_path):
+    made = SyntheticRun(tmp_path)
+    record(made, "agent-01", with_range("m", "json"), [(0.0, [7.0])])
+    record(made, "agent-02", with_range("km", "json"), [(0.0, [8.0])])
+
+    table = gathered_table(made, "radar")
+
+    assert table.fields[1] == Field("range_", "", "json")
+    assert table.read("agent-02", ("range_",))["range_"].tolist() == ["[8.0]"]
+
+
 def test_field_named_as_our_own_column_is_kept_beside_it(tmp_path):
     made = SyntheticRun(tmp_path)
     schema = StreamSchema("links", (Field("agent", "", "str"), Field("range_m", "m")))
@@ -434,6 +491,27 @@ def test_table_of_a_million_rows_is_written_in_little_memory(tmp_path):
     values = table.read("agent-01", ("tick", "margin_us"))
     assert values["tick"].tolist() == list(range(ROWS))
     assert values["margin_us"][-1] == (ROWS - 1) % 9973 + 0.25
+
+
+def test_records_of_large_texts_make_row_groups_of_few_and_small_ones_of_many(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr("cosmos_cli.evidence.tables.BYTES_PER_GROUP", 1 << 20)
+    made = SyntheticRun(tmp_path)
+    letters = [chr(ord("a") + index % 26) * 32_768 for index in range(128)]
+    record(
+        made, "agent-01", MIXED, [(0.0, i, 0.0, text, True, None) for i, text in enumerate(letters)]
+    )
+    record(made, "agent-02", MIXED, [(0.0, i, 0.0, "x", True, None) for i in range(10_000)])
+
+    table = gathered_table(made, "mixed")
+
+    file = pq.ParquetFile(table.path)
+    rows = [file.metadata.row_group(index).num_rows for index in range(file.num_row_groups)]
+    assert rows[-1] == 10_000
+    assert max(rows[:-1]) <= 40  # of 32 KiB each
+    assert table.read("agent-01", ("name",))["name"].tolist() == letters
+    assert table.read("agent-01", ("count",))["count"].tolist() == list(range(128))
 
 
 NAMES = {"agent-01": "IRIDIUM 8", "agent-02": "IRIDIUM 7"}

@@ -17,6 +17,7 @@ from cosmos_cli.evidence.remarks import (
 )
 from cosmos_cli.evidence.run_directory import write_json
 from cosmos_cli.evidence.streams import RecordFile, StreamScan
+from cosmos_cli.models.declared_streams import AgentStreams
 from cosmos_cli.models.loading import load_scenario
 from madns_runtime.config import to_mapping
 from madns_runtime.plugin.api import DeclaredStream
@@ -75,6 +76,23 @@ def test_open_stream_takes_further_fields_and_holds_those_it_declares():
     assert told(of_agents(TICK, is_open=True), scan("radar", TICK, RANGE)) == ()
     (remark,) = told(of_agents(TICK, is_open=True), scan("radar", Field("tick"), RANGE))
     assert "field tick is float where int is declared" in remark
+
+
+def test_what_is_declared_for_some_agents_is_remarked_on_by_their_own_declaration():
+    own = AgentStreams(agents=("agent-02",), streams=tuple(of_agents(TICK, Field("range_m", "km"))))
+    plan = {
+        "streams": [to_mapping(stream) for stream in of_agents(TICK, RANGE)],
+        "agent_streams": [to_mapping(own)],
+    }
+    in_km = scan("radar", TICK, Field("range_m", "km"), source="agent-02")
+    fitting = [scan("radar", TICK, RANGE), in_km]
+    swapped = [scan("radar", *in_km.file.fields), scan("radar", TICK, RANGE, source="agent-02")]
+
+    assert undeclared_remarks(declared_streams(plan), fitting) == ()
+    assert undeclared_remarks(declared_streams(plan), swapped) == (
+        "agent-01: stream radar: field range_m is float in km where float in m is declared",
+        "agent-02: stream radar: field range_m is float in m where float in km is declared",
+    )
 
 
 def test_remarks_are_bounded_and_the_rest_is_counted():
@@ -142,6 +160,56 @@ def test_run_tells_what_its_simulation_did_not_declare(tmp_path, mode):
     remarks = json.loads(done.stdout)["remarks"]
     expected = f"agent-01 and 1 more: stream extra is {NOT_DECLARED}"
     assert [text for text in remarks if "stream" in text] == [expected]
+
+
+IN_UNITS = """
+from dataclasses import dataclass
+from typing import Literal
+from madns_runtime.plugin.api import AgentSimulation, DeclaredStream, Simulation
+from madns_runtime.recording.records import Field
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameters:
+    unit: Literal["m", "km"] = "m"
+
+def fields(parameters):
+    return (Field("tick", "", "int"), Field("range_", parameters.unit))
+
+class A(AgentSimulation):
+    def setup(self, context, initial):
+        self.context = context
+        context.open_stream("path", fields(context.parameters))
+    def step(self, tick):
+        self.context.record("path", (tick.index, 1.0 if self.context.parameters.unit == "km" else 100.0))
+
+def streams(parameters, agents):
+    return [DeclaredStream(role="agent", name="path", fields=fields(parameters))]
+
+simulation = Simulation(name="p", parameters=Parameters, agent=":A", streams=":streams")
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("agent", ["agent-01", "agent-02"])
+@pytest.mark.parametrize("unit", [", unit: m", ""])
+def test_an_agent_that_records_in_another_unit_is_judged_in_that_of_the_limit(
+    tmp_path, agent, unit
+):
+    (tmp_path / "p.py").write_text(IN_UNITS)
+    (tmp_path / "a.yaml").write_text(
+        "name: a\nsimulation: ./p.py:simulation\nagents: {count: 2}\n"
+        "time: {mode: lockstep, duration_s: 0.5}\n"
+        f"agent_parameters: [{{agents: [{agent}], parameters: {{unit: km}}}}]\n"
+        f"checks: [{{name: near, stream: path, field: range_, statistic: max, below: 500{unit}}}]\n"
+    )
+
+    done = CosmosCommand(tmp_path)("run", "a.yaml", "--json", "--no-report")
+
+    document = json.loads(done.stdout)
+    (near,) = (each for each in document["checks"] if each["name"] == "near")
+    assert (near["got"], near["limit"], near["unit"]) == (1000.0, 500.0, "m")
+    assert (near["passed"], near["agent"]) == (False, agent)
+    assert [text for text in document["remarks"] if "stream" in text] == []
 
 
 @pytest.mark.process

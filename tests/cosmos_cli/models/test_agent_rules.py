@@ -126,6 +126,59 @@ def test_what_a_rule_makes_agents_declare_and_take_is_theirs(load):
 
 
 @pytest.mark.process
+def test_fields_that_a_rule_makes_agents_declare_in_a_stream_of_all_may_be_judged(load, tmp_path):
+    plugin = PLUGIN.replace('fields=(Field("x", ""),)', "fields=fields(parameters)").replace(
+        "def streams(",
+        "def fields(parameters):\n"
+        "    own = (Field('y', 'm'),) if parameters.mass_kg > 2 else ()\n"
+        "    return (Field('t_s', 's'), Field('x', 'km' if own else 'm'), *own)\n\ndef streams(",
+    )
+    (tmp_path / "plug.py").write_text(plugin)
+    check = "checks: [{name: c, stream: drive, field: %s, statistic: max, below: 1%s}]\n"
+    rule = "  - {agents: [agent-3], parameters: {mass_kg: 3}}\n"
+
+    found = load(OWN + rule + check % ("y", ", stop_when_broken: true"))
+
+    assert [[field.name for field in each.fields] for each in found.streams] == [["t_s", "x"]]
+    (own,) = found.agent_streams
+    assert own.agents == ("agent-3",)
+    assert [field.name for field in own.streams[0].fields] == ["t_s", "x", "y"]
+    assert [each.unit for each in found.expectations] == [""]
+    (in_metres,) = load(OWN + rule + check % ("x", "")).expectations
+    assert in_metres.unit == "m"
+    told = "stream drive has x in m and in km, by who records it, so nothing acts on it in the run"
+    with pytest.raises(InputError, match=told):
+        load(OWN + rule + check % ("x", ", stop_when_broken: true"))
+
+
+@pytest.mark.process
+def test_a_column_is_a_field_of_what_some_agents_declare(load, refusal, tmp_path):
+    columns = 'columns=("drive.x", "more.x"), place_uses='
+    (tmp_path / "plug.py").write_text(PLUGIN.replace("place_uses=", columns, 1))
+    rule = "  - {agents: [agent-3], parameters: {mass_kg: 3, extra_stream: %s}}\n"
+
+    load(OWN + rule % "more")
+    told = refusal(OWN + rule % "other")
+
+    unknown = "columns: 'more.x' is no field of an agent's stream that streams() declares"
+    assert told.count(unknown) == 1
+    assert "drive.x" not in told
+
+
+@pytest.mark.process
+def test_streams_that_could_not_be_asked_make_no_column_a_fault(load, refusal, tmp_path):
+    plugin = PLUGIN.replace("place_uses=", 'columns=("more.x",), place_uses=', 1)
+    (tmp_path / "plug.py").write_text(
+        plugin.replace("    names = [", "    assert not parameters.extra_stream\n    names = [", 1)
+    )
+
+    told = refusal(OWN + "  - {agents: [agent-3], parameters: {extra_stream: more}}\n")
+
+    assert "AssertionError" in told
+    assert "columns" not in told
+
+
+@pytest.mark.process
 def test_what_is_odd_in_a_rule_is_remarked_at_the_rule_and_of_all_once(load, tmp_path):
     (tmp_path / "plug.py").write_text(
         PLUGIN.replace(

@@ -11,7 +11,12 @@ from cosmos_cli.report.build import build_sections
 from cosmos_cli.report.plotly_figures import to_plotly
 from madns_runtime.analysis.breaks import gap_starts, wrap_starts
 from madns_runtime.analysis.lines import grouped_lines
-from madns_runtime.analysis.sampling import TimeEnvelope, envelope_series
+from madns_runtime.analysis.sampling import (
+    POINTS_PER_FIGURE,
+    SERIES_PER_FIGURE,
+    TimeEnvelope,
+    envelope_series,
+)
 from madns_runtime.analysis.values import Axis, Figure, FigureChoice, Floats, Form, Series
 from madns_runtime.recording.records import Field, StreamSchema
 
@@ -191,3 +196,24 @@ def test_line_that_is_broken_already_has_no_second_break() -> None:
 
     assert np.array_equal(trace["x"], mark.x)
     assert strokes(trace["x"], trace["y"]) == [(39.0, 60.0)]
+
+
+def test_lines_of_a_figure_are_bounded_and_the_rest_is_told() -> None:
+    x = np.arange(200.0)
+    series = {f"agent-{number:04}": (x, x) for number in range(1, 1001)}
+
+    figure, remark = grouped_lines(series, title="some", y=Axis(unit="m"))
+
+    marks = [mark for choice in figure.choices for mark in choice.marks]
+    assert len(marks) == SERIES_PER_FIGURE == 666
+    assert sum(len(mark.x) for mark in marks) <= POINTS_PER_FIGURE
+    assert remark.text == "some: 334 of 1000 are not drawn, those behind agent-0666."
+
+
+def test_lines_up_to_the_bound_are_all_drawn() -> None:
+    x = np.arange(3.0)
+    series = {str(number): (x, x) for number in range(SERIES_PER_FIGURE)}
+
+    (figure,) = grouped_lines(series, title="some", y=Axis(unit="m"))
+
+    assert sum(len(choice.marks) for choice in figure.choices) == SERIES_PER_FIGURE

@@ -582,6 +582,15 @@ def test_array_is_stored_as_short_as_its_curve_allows(values, dtype):
     np.testing.assert_allclose(back, values, rtol=0, atol=1e-3 * spread)
 
 
+def test_array_whose_spread_is_no_float_keeps_its_values():
+    values = np.array([1.0, 2.0, -1e308, 1e308])
+
+    encoded = encode_array(values)
+
+    assert encoded["dtype"] == "f8"
+    assert np.frombuffer(base64.b64decode(encoded["bdata"])).tolist() == values.tolist()
+
+
 @pytest.mark.parametrize(
     ("value", "text"),
     [
