@@ -12,7 +12,8 @@ import numpy as np
 from cosmos_cli.diff.fields import FieldDifference, RecordPlace, place_of, subject_of
 from cosmos_cli.diff.recorded import ROWS_READ_MAX, Recorded
 from cosmos_cli.evidence.streams import NUMBER_KINDS
-from madns_runtime.analysis.matching import Matched, Rows, joined, match
+from madns_runtime.analysis.matching import KeyWentBackError, Matched, Orders, Rows, joined, match
+from madns_runtime.analysis.record_order import RecordOrder, learn_order
 from madns_runtime.analysis.sampling import as_array
 from madns_runtime.analysis.values import Floats
 from madns_runtime.recording.records import Field
@@ -165,6 +166,24 @@ def diff_stream(
     Raises:
         MachineError: A file cannot be read.
     """
+    try:
+        return _diff(a, b, pairing, agents, None)
+    except KeyWentBackError:
+        scaled = zip((a, b), pairing.scales, strict=True)
+        first, second = (_order(one, pairing, scale, agents) for one, scale in scaled)
+        return _diff(a, b, pairing, agents, (first, second))
+
+
+def _diff(
+    a: Recorded, b: Recorded, pairing: Pairing, agents: Sequence[str], orders: Orders | None
+) -> StreamDifference:
+    """
+    Compare one stream, without *orders* as its keys grow.
+
+    Raises:
+        KeyWentBackError: They do not, so that the orders have to be known.
+        MachineError: A file cannot be read.
+    """
     units_a, units_b = ({f.name: f.unit for f in one.fields} for one in (a, b))
     names = tuple(n for n in a.names() if n in b.names() and units_a[n] == units_b[n])
     keys = (pairing.column, *pairing.identity)
@@ -181,10 +200,20 @@ def diff_stream(
         _rows(a, names, pairing, scale=pairing.scales[0], agents=agents),
         _rows(b, names, pairing, scale=pairing.scales[1], agents=agents),
     )
-    for piece in match(*sides, tolerance=pairing.tolerance):
+    for piece in match(*sides, tolerance=pairing.tolerance, orders=orders, must_wait=True):
         _take(found, piece)
     found.is_identical = found.has_same_values and not (a.files or b.files)
     return found
+
+
+def _order(
+    recorded: Recorded, pairing: Pairing, scale: float, agents: Sequence[str]
+) -> RecordOrder:
+    """Return in which order a stream's records stand, by what tells how they find each other alone."""
+    needed = (pairing.column, pairing.rank, *pairing.identity, *OWNERS)
+    names = tuple(name for name in recorded.names() if name in needed)
+    rows = _rows(recorded, names, pairing, scale=scale, agents=agents)
+    return learn_order((batch.keys, batch.who) for batch in rows)
 
 
 def _others_of(
