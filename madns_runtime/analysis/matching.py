@@ -200,27 +200,30 @@ def _settle(a: _Side, b: _Side, frontiers: _Frontiers, tolerance: float) -> Matc
     is_over_a, is_over_b = (
         ~(rows.keys > frontiers.of(rows) - tolerance) for rows in (rows_a, rows_b)
     )
+    in_a = in_b = np.empty(0, dtype=np.int64)
     if is_over_a.any() or is_over_b.any():
         in_a, in_b = pair_up(rows_a, rows_b, tolerance)
-        is_sure = is_over_a[in_a] & is_over_b[in_b]
-        in_a, in_b = in_a[is_sure], in_b[is_sure]
-    else:
-        in_a = in_b = np.empty(0, dtype=np.int64)
-    is_left_a, is_left_b = _without(rows_a, in_a), _without(rows_b, in_b)
-    a.held, b.held = rows_a.take(is_left_a & ~is_over_a), rows_b.take(is_left_b & ~is_over_b)
+    is_sure = is_over_a[in_a] & is_over_b[in_b]
+    # Whoever has found a partner of which it is not sure yet is not alone: it waits with it.
+    alone_a, keep_a = _others(is_over_a, in_a, is_sure)
+    alone_b, keep_b = _others(is_over_b, in_b, is_sure)
+    a.held, b.held = rows_a.take(keep_a), rows_b.take(keep_b)
     return Matched(
-        a=rows_a.take(in_a),
-        b=rows_b.take(in_b),
-        only_a=rows_a.take(is_left_a & is_over_a),
-        only_b=rows_b.take(is_left_b & is_over_b),
+        a=rows_a.take(in_a[is_sure]),
+        b=rows_b.take(in_b[is_sure]),
+        only_a=rows_a.take(alone_a),
+        only_b=rows_b.take(alone_b),
     )
 
 
-def _without(rows: Rows, paired: Indices) -> NDArray[np.bool_]:
-    """Return a mask of the rows that have no partner yet."""
-    is_left = np.ones(len(rows), dtype=np.bool_)
-    is_left[paired] = False
-    return is_left
+def _others(
+    is_over: NDArray[np.bool_], paired: Indices, is_sure: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return masks of what is surely alone, and of what is kept."""
+    is_alone, is_kept = is_over.copy(), ~is_over
+    is_alone[paired] = False
+    is_kept[paired] = ~is_sure
+    return is_alone, is_kept
 
 
 def _on_one_line(a: Rows, b: Rows, tolerance: float) -> tuple[Floats, Floats]:

@@ -117,6 +117,16 @@ def test_a_nearer_record_of_a_later_batch_is_waited_for():
     assert (found["a"], found["b"], found["only_b"]) == ([1.0, 2.0], [1.1, 2.0], [0.6])
 
 
+def test_a_record_waits_with_the_partner_that_it_has_found():
+    a = [rows([1.0]), rows([1.7]), rows([9.0])]
+    b = [rows([1.3]), rows([3.0]), rows([9.0])]
+
+    found = settled(match(a, b, tolerance=0.5))
+
+    assert (found["a"], found["b"]) == ([1.0, 9.0], [1.3, 9.0])
+    assert (found["only_a"], found["only_b"]) == ([1.7], [3.0])
+
+
 def test_huge_streams_are_held_in_small_part():
     count, size, read, done, held = 200_000, 1000, 0, 0, []
 
