@@ -26,6 +26,8 @@ IDENTITY = ("agent", "satellite", "sender", "to", "receiver", "station", "kind",
 """Text fields that tell whom or what a record is about; records match only where they agree."""
 TIMES = ("t_s", "commanded_s", "sent_s", "rise_s", "at_s")
 """Fields of a time, in the order in which they are tried."""
+PACKET = "packet"
+"""Field that counts one message every tick, as the counter's do; beside a time it counts something else."""
 RANK = "number"
 """Field of a record's own number: those of one time are pairs in its order, whenever each was recorded."""
 OWNERS = ("agent", "sender")
@@ -131,15 +133,16 @@ def choose_pairing(a: Sequence[Field], b: Sequence[Field], tick_hz: tuple[float,
     common = {f.name: f for f in a if any((f.name, f.unit) == (o.name, o.unit) for o in b)}
     identity = tuple(n for n in IDENTITY if n in common and common[n].kind == "str")
     numbers = {name for name, one in common.items() if one.kind in NUMBER_KINDS}
-    for name in ("tick", "packet"):
-        if name in numbers and tick_hz[0] == tick_hz[1]:
-            return Pairing(by="tick", column=name, identity=identity)
-        if name in numbers:
-            scales = (1.0 / tick_hz[0], 1.0 / tick_hz[1])
-            return Pairing(
-                by="time", column=name, scales=scales, tolerance=SAME_TIME_S, identity=identity
-            )
     time = next((name for name in TIMES if name in numbers), None)
+    ticks = ("tick",) if time is not None else ("tick", PACKET)
+    tick = next((name for name in ticks if name in numbers), None)
+    if tick is not None and tick_hz[0] == tick_hz[1]:
+        return Pairing(by="tick", column=tick, identity=identity)
+    if tick is not None:
+        scales = (1.0 / tick_hz[0], 1.0 / tick_hz[1])
+        return Pairing(
+            by="time", column=tick, scales=scales, tolerance=SAME_TIME_S, identity=identity
+        )
     if time is not None:
         rank = RANK if RANK in numbers else ""
         tolerance = 0.5 / max(tick_hz)

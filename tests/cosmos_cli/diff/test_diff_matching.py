@@ -272,6 +272,18 @@ def test_records_are_paired_by_tick_by_time_or_by_their_order():
     assert choose_pairing([TICK], words, same).by == "tick"
 
 
+def test_a_packet_counts_as_a_tick_only_where_nothing_tells_the_time():
+    packet, sent = Field("packet", "", "int"), Field("sent_s", "s")
+
+    without = choose_pairing([packet], [packet], (10.0, 10.0))
+    timed = choose_pairing([packet, sent, AGENT], [packet, sent, AGENT], (10.0, 5.0))
+    ticked = choose_pairing([packet, sent, TICK], [packet, sent, TICK], (10.0, 10.0))
+
+    assert (without.by, without.column) == ("tick", "packet")
+    assert (timed.by, timed.column, timed.scales) == ("time", "sent_s", (1.0, 1.0))
+    assert (ticked.by, ticked.column) == ("tick", "tick")
+
+
 def test_settings_differ_by_dotted_key():
     a = {"seed": 1, "run": "x", "agents": {"count": 2}, "stations": [{"name": "S", "h": 1}]}
     b = {"seed": 1, "run": "y", "agents": {"count": 3}, "stations": [{"name": "S", "h": 2}], "n": 0}
