@@ -198,7 +198,9 @@ def _compare_streams(
         is_alike = of_a[key].fields == of_b[key].fields
         lines, other = (one[key].lines() if is_alike else None for one in (of_a, of_b))
         _note_changes(result, lines, other)
-        if lines is not None and other is not None and lines.is_same(other):
+        # The same ticks at different rates are other instants.
+        is_same_time = pairing.scales[0] == pairing.scales[1]
+        if lines is not None and other is not None and is_same_time and lines.is_same(other):
             identical[key] = lines.records
             found = identical_stream(of_a[key], pairing.by, lines.records)
         else:

@@ -176,6 +176,27 @@ def test_different_tick_rates_are_matched_by_time_and_said(make, capsys):
     assert state["fields"]["x_m"]["max"] < 1e-6  # the same orbit at the same instants
 
 
+def record_path(made):
+    """Record a path by ticks alone, of which only the rate tells the times."""
+    fields = (Field("tick", "", "int"), Field("x_m", "m"))
+    recorder = made.recorder("agents/agent-01", "agent-01", StreamSchema("path", fields))
+    for tick in range(20):
+        recorder.record("path", (tick, 7.0 * tick))
+    recorder.close()
+
+
+def test_the_same_ticks_at_another_rate_are_other_instants(make, capsys):
+    make(record_path), make(record_path, ticks=TICKS // 2, tick_hz=5.0)
+
+    code, document = diff(capsys, "1", "2", "--streams", "path", "--expect-same")
+
+    path = streams_of(document)["path"]
+    assert (code, document["identical"]) == (1, False)
+    assert (path["by"], path["matched"], path["identical"]) == ("time", 10, False)
+    assert (path["only_a"]["count"], path["only_b"]["count"]) == (10, 10)
+    assert path["fields"]["x_m"]["different"] == 9
+
+
 @pytest.mark.parametrize("table", ["as it is", "gone"])
 @pytest.mark.parametrize(
     ("fields", "told"),
