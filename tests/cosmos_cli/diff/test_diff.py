@@ -433,6 +433,23 @@ def test_records_without_a_time_are_matched_among_those_of_the_agents_that_are_c
     assert diff(capsys, "1", "2", "--streams", "ranks", "--expect-same")[0] == 1
 
 
+@pytest.mark.parametrize("table", ["as it is", "gone"])
+def test_of_a_hosts_identical_records_those_of_chosen_agents_alone_are_counted(make, capsys, table):
+    for _ in range(2):
+        made = make(lambda made: record_ranks(made, others=2))
+        if table == "gone":
+            (made.run.tables / "host_ranks.parquet").unlink()
+
+    code, document = diff(
+        capsys, "1", "2", "--streams", "ranks", "--agents", "agent-01", "--expect-same"
+    )
+
+    ranks = streams_of(document)["host_ranks"]
+    assert (code, document["identical"], ranks["identical"]) == (0, True, True)
+    assert (ranks["rows"], ranks["matched"]) == ([20, 20], 20)
+    assert diff(capsys, "1", "2", "--streams", "ranks")[1]["streams"][0]["matched"] == 60
+
+
 def record_device(made, value):
     """Record a device of agent-02, and one of the inventory."""
     gyro = StreamSchema("gyro", (Field("t_s", "s"), Field("gyro", "rad/s")))
