@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -11,22 +10,21 @@ from typing import Annotated
 import typer
 
 from cosmos_cli.commands.run_arguments import RunsOption
+from cosmos_cli.diff.chosen import check_chosen, check_will_be_chosen
 from cosmos_cli.diff.compare import Comparison, Selection, compare
 from cosmos_cli.diff.document import several_documents, to_document
 from cosmos_cli.diff.page import write_comparisons
-from cosmos_cli.diff.side import Side, check_comparable, open_side
+from cosmos_cli.diff.side import check_comparable, open_side
 from cosmos_cli.diff.terminal import count_figures, print_comparison
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
-from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.models.overrides import told_as_options
 from cosmos_cli.system.named_file import check_writable, named_file
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
-from cosmos_cli.ui.name_ranges import compact
 from cosmos_cli.ui.plural import counted
 from cosmos_cli.ui.progress import told_progress
 from cosmos_cli.view.factory import make_view
@@ -84,13 +82,15 @@ def diff(
     console = Console(json=as_json, quiet=quiet, instead=instead)
     code = ExitCode.OK
     names = [a, *others]
+    chosen = Selection(agents=tuple(agents or ()), streams=tuple(streams or ()))
     if html is not None:
         check_writable(html)
     if len(names) > RUNS_MAX:
         raise InputError(f"expected at most {RUNS_MAX} runs, got {len(names)}")
     if run_first:
         with told_as_options({"time.duration_s": "--duration"}, set_ or ()):
-            found, code = _run_all(names, console, folder, overrides=_overrides(set_, duration_s))
+            scenarios = _load_all(names, console, _overrides(set_, duration_s), chosen)
+            found, code = _run_all(scenarios, console, folder)
     elif set_ or duration_s is not None:
         raise InputError(
             "--set and --duration change scenarios; give them with --run A.yaml B.yaml"
@@ -98,9 +98,7 @@ def diff(
     else:
         root = runs_root(folder)
         found = [find_run(root, name) for name in names]
-    comparisons = _compare_each(
-        found, names, tuple(agents or ()), tuple(streams or ()), console=console
-    )
+    comparisons = _compare_each(found, names, chosen, console=console)
     _tell(console, comparisons, html)
     if code is ExitCode.OK and expect_same and not all(one.is_same for one in comparisons):
         code = ExitCode.RUN_FAILED
@@ -129,49 +127,28 @@ def _overrides(set_: list[str] | None, duration_s: float | None) -> list[str]:
 
 
 def _compare_each(
-    found: Sequence[RunDirectory],
-    names: Sequence[str],
-    agents: tuple[str, ...],
-    streams: tuple[str, ...],
-    *,
-    console: Console,
+    found: Sequence[RunDirectory], names: Sequence[str], chosen: Selection, *, console: Console
 ) -> list[Comparison]:
     """Compare all runs but the first with it; that they can be compared is known before the first is read."""
-    labelled = {name: None for run in found for name in run_labels(run).labelled(agents)}
-    selection = Selection(agents=(*agents, *labelled), streams=streams)
+    labelled = {name: None for run in found for name in run_labels(run).labelled(chosen.agents)}
+    selection = Selection(agents=(*chosen.agents, *labelled), streams=chosen.streams)
     first, *others = [open_side(run, name) for run, name in zip(found, names, strict=True)]
     for other in others:
         check_comparable(first, other)
-    _check_chosen((first, *others), agents, streams)
+    check_chosen((first, *others), chosen)
     with told_progress(console, "diff") as progress:
         return [compare(first, other, selection, progress) for other in others]
 
 
-def _check_chosen(sides: Sequence[Side], agents: tuple[str, ...], streams: tuple[str, ...]) -> None:
+def _load_all(
+    paths: Sequence[str], console: Console, overrides: list[str], chosen: Selection
+) -> list[ScenarioFile]:
     """
-    Refuse a word that chooses nothing: one that is misspelt would pass for runs without a difference.
+    Load scenarios of one simulation.
 
     Raises:
-        InputError: There is one.
+        InputError: One has faults, or is of another simulation, or nothing of them would be chosen by a word.
     """
-    labels = [run_labels(side.run) for side in sides] if agents else []
-    for glob in agents:
-        if not any(own.like(glob, side.agents) for own, side in zip(labels, sides, strict=True)):
-            known = compact(name for side in sides for name in side.agents)
-            raise InputError(
-                f"--agents {glob}: no agent of these runs is called so; there are {known}"
-            )
-    names = sorted({name for side in sides for name in side.stream_names})
-    for glob in streams:
-        if not fnmatch.filter(names, glob):
-            hint = did_you_mean(glob, names)
-            raise InputError(f"--streams {glob}: these runs recorded no such stream{hint}")
-
-
-def _run_all(
-    paths: Sequence[str], console: Console, folder: Path | None, *, overrides: list[str]
-) -> tuple[list[RunDirectory], ExitCode]:
-    """Run scenarios one after the other; all are checked before the first starts."""
     scenarios = [load_scenario(Path(path), overrides, warn=console.warn) for path in paths]
     first = scenarios[0].scenario.simulation
     for path, scenario in zip(paths, scenarios, strict=True):
@@ -180,6 +157,14 @@ def _run_all(
                 f"expected scenarios of one simulation, got {paths[0]} of {first} and {path} of"
                 f" {scenario.scenario.simulation}"
             )
+    check_will_be_chosen(scenarios, chosen)
+    return scenarios
+
+
+def _run_all(
+    scenarios: Sequence[ScenarioFile], console: Console, folder: Path | None
+) -> tuple[list[RunDirectory], ExitCode]:
+    """Run scenarios one after the other; after one that failed, no further one."""
     root = runs_root(folder)
     runs, code = [], ExitCode.OK
     for number, scenario in enumerate(scenarios, start=1):

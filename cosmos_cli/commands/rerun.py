@@ -131,4 +131,5 @@ def _fly(
             remarks=(*remarks, *action_remarks(recorded.run, summary.run, flown.left_out)),
             unlike=flown.unlike,
             expectations=compare_expectations(recorded.run, summary.run),
+            is_exact=flown.is_exact,
         )

@@ -87,6 +87,10 @@ class Selection:
         # What the framework records measures the computers: it is compared when it is named.
         return recorded.stream not in FRAMEWORK_STREAMS
 
+    def parts(self, recorded: Recorded) -> bool:
+        """Tell whether of a stream that is compared some records are not: a host's are of all agents."""
+        return bool(self.agents) and recorded.role == "host"
+
 
 @dataclass(slots=True, kw_only=True)
 class Comparison:
@@ -198,11 +202,17 @@ def _compare_streams(
         is_alike = of_a[key].fields == of_b[key].fields
         lines, other = (one[key].lines() if is_alike else None for one in (of_a, of_b))
         _note_changes(result, lines, other)
-        if lines is not None and other is not None and lines.is_same(other):
+        # The same ticks at different rates are other instants.
+        is_same_time = pairing.scales[0] == pairing.scales[1]
+        is_identical = bool(lines and other and is_same_time and lines.is_same(other))
+        if lines is not None and is_identical:
             identical[key] = lines.records
+        if lines is not None and is_identical and not selection.parts(of_a[key]):
             found = identical_stream(of_a[key], pairing.by, lines.records)
         else:
             found = diff_stream(of_a[key], of_b[key], pairing, agents=selection.agents)
+            # Of what is the same bit by bit any part is.
+            found.is_identical = found.is_identical or is_identical
         result.streams.append(found)
         done += size
     progress("comparing by the simulation", 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Iterable
@@ -126,7 +127,7 @@ class FieldDifference:
 
     def _add_texts(self, a: Rows, left: NDArray[Any], right: NDArray[Any]) -> None:
         pairs = zip(left.tolist(), right.tolist(), strict=True)
-        is_different = np.array([_differ(x, y) for x, y in pairs], dtype=bool)
+        is_different = np.array([_differ(x, y, self.field.kind) for x, y in pairs], dtype=bool)
         self.different += int(is_different.sum())
         self._note_first(a, is_different)
         if self.values is None and is_different.any():
@@ -173,22 +174,39 @@ def _number(value: Any) -> int | float:
     return int(value) if isinstance(value, int | np.integer) else float(value)
 
 
-def _differ(left: Any, right: Any) -> bool:
-    """Tell whether two values are not the same; nested too deep to be compared, they are not."""
+def _differ(left: Any, right: Any, kind: str) -> bool:
+    """Tell whether two values that are no numbers are not the same; nested too deep to be compared, they are not."""
+    if left is None or right is None or (isinstance(left, str) and left == right):
+        return left is not right and left != right
+    if kind == "bool":
+        return bool(left != right) or isinstance(left, bool) != isinstance(right, bool)
     try:
-        return bool(left != right and _plain(left) != _plain(right))
+        text = _canonical if kind == "json" else _as_in_table
+        return text(left) != text(right)
     except RecursionError:
         return True
 
 
-def _plain(value: Any) -> Any:
-    """Return what a JSON value is, whether it comes from a line or, as text, from a table."""
-    if isinstance(value, str) and value[:1] in ("{", "["):
-        try:
-            return json.loads(value)
-        except ValueError:
-            return value
-    return value
+def _as_in_table(value: Any) -> str:
+    """Return a text as it is, and what was recorded in its place as a table has it."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _canonical(value: Any) -> str:
+    """Return a JSON value, from a line or, as text, from a table, as the text that no other value has; 1 and 1.0 are one."""
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):  # a text as it is
+            value = json.loads(value)
+    return json.dumps(_with_whole_numbers(value), sort_keys=True)
+
+
+def _with_whole_numbers(value: Any) -> Any:
+    """Return a JSON value whose floats are ints where they are whole."""
+    if isinstance(value, dict):
+        return {key: _with_whole_numbers(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_with_whole_numbers(item) for item in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _told(value: Any) -> str | None:

@@ -12,7 +12,8 @@ import numpy as np
 from cosmos_cli.diff.fields import FieldDifference, RecordPlace, place_of, subject_of
 from cosmos_cli.diff.recorded import ROWS_READ_MAX, Recorded
 from cosmos_cli.evidence.streams import NUMBER_KINDS
-from madns_runtime.analysis.matching import Matched, Rows, joined, match
+from madns_runtime.analysis.matching import KeyWentBackError, Matched, Orders, Rows, joined, match
+from madns_runtime.analysis.record_order import RecordOrder, learn_order
 from madns_runtime.analysis.sampling import as_array
 from madns_runtime.analysis.values import Floats
 from madns_runtime.recording.records import Field
@@ -25,6 +26,8 @@ IDENTITY = ("agent", "satellite", "sender", "to", "receiver", "station", "kind",
 """Text fields that tell whom or what a record is about; records match only where they agree."""
 TIMES = ("t_s", "commanded_s", "sent_s", "rise_s", "at_s")
 """Fields of a time, in the order in which they are tried."""
+PACKET = "packet"
+"""Field that counts one message every tick, as the counter's do; beside a time it counts something else."""
 RANK = "number"
 """Field of a record's own number: those of one time are pairs in its order, whenever each was recorded."""
 OWNERS = ("agent", "sender")
@@ -130,15 +133,16 @@ def choose_pairing(a: Sequence[Field], b: Sequence[Field], tick_hz: tuple[float,
     common = {f.name: f for f in a if any((f.name, f.unit) == (o.name, o.unit) for o in b)}
     identity = tuple(n for n in IDENTITY if n in common and common[n].kind == "str")
     numbers = {name for name, one in common.items() if one.kind in NUMBER_KINDS}
-    for name in ("tick", "packet"):
-        if name in numbers and tick_hz[0] == tick_hz[1]:
-            return Pairing(by="tick", column=name, identity=identity)
-        if name in numbers:
-            scales = (1.0 / tick_hz[0], 1.0 / tick_hz[1])
-            return Pairing(
-                by="time", column=name, scales=scales, tolerance=SAME_TIME_S, identity=identity
-            )
     time = next((name for name in TIMES if name in numbers), None)
+    ticks = ("tick",) if time is not None else ("tick", PACKET)
+    tick = next((name for name in ticks if name in numbers), None)
+    if tick is not None and tick_hz[0] == tick_hz[1]:
+        return Pairing(by="tick", column=tick, identity=identity)
+    if tick is not None:
+        scales = (1.0 / tick_hz[0], 1.0 / tick_hz[1])
+        return Pairing(
+            by="time", column=tick, scales=scales, tolerance=SAME_TIME_S, identity=identity
+        )
     if time is not None:
         rank = RANK if RANK in numbers else ""
         tolerance = 0.5 / max(tick_hz)
@@ -165,6 +169,24 @@ def diff_stream(
     Raises:
         MachineError: A file cannot be read.
     """
+    try:
+        return _diff(a, b, pairing, agents, None)
+    except KeyWentBackError:
+        scaled = zip((a, b), pairing.scales, strict=True)
+        first, second = (_order(one, pairing, scale, agents) for one, scale in scaled)
+        return _diff(a, b, pairing, agents, (first, second))
+
+
+def _diff(
+    a: Recorded, b: Recorded, pairing: Pairing, agents: Sequence[str], orders: Orders | None
+) -> StreamDifference:
+    """
+    Compare one stream, without *orders* as its keys grow.
+
+    Raises:
+        KeyWentBackError: They do not, so that the orders have to be known.
+        MachineError: A file cannot be read.
+    """
     units_a, units_b = ({f.name: f.unit for f in one.fields} for one in (a, b))
     names = tuple(n for n in a.names() if n in b.names() and units_a[n] == units_b[n])
     keys = (pairing.column, *pairing.identity)
@@ -181,10 +203,20 @@ def diff_stream(
         _rows(a, names, pairing, scale=pairing.scales[0], agents=agents),
         _rows(b, names, pairing, scale=pairing.scales[1], agents=agents),
     )
-    for piece in match(*sides, tolerance=pairing.tolerance):
+    for piece in match(*sides, tolerance=pairing.tolerance, orders=orders, must_wait=True):
         _take(found, piece)
     found.is_identical = found.has_same_values and not (a.files or b.files)
     return found
+
+
+def _order(
+    recorded: Recorded, pairing: Pairing, scale: float, agents: Sequence[str]
+) -> RecordOrder:
+    """Return in which order a stream's records stand, by what tells how they find each other alone."""
+    needed = (pairing.column, pairing.rank, *pairing.identity, *OWNERS)
+    names = tuple(name for name in recorded.names() if name in needed)
+    rows = _rows(recorded, names, pairing, scale=scale, agents=agents)
+    return learn_order((batch.keys, batch.who) for batch in rows)
 
 
 def _others_of(

@@ -7,24 +7,20 @@ from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Final
 
-import numpy as np
-
 from cosmos_cli.diff.compare import Comparison
 from cosmos_cli.diff.document import to_document
 from cosmos_cli.diff.fields import FieldDifference
 from cosmos_cli.diff.stream import StreamDifference
 from cosmos_cli.models.known_streams import OF_DEVICES_OWN
-from cosmos_cli.rerun.device_comparison import SAME_TIME_S, ChannelComparison
+from cosmos_cli.rerun.device_comparison import ChannelComparison
 from cosmos_cli.rerun.expectations import ExpectationComparison
+from cosmos_cli.rerun.rounding import is_rounding
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.plural import counted
-from madns_runtime.analysis.sampling import as_array
 
 SCHEMA: Final = 1
 NOTHING_COMPARED: Final = "neither run has a record that is judged"
 STREAMS_SHOWN_MAX: Final = 20
-ROUNDING_RATIO: Final = 1e-8
-"""Of a field's largest value: what half a microsecond moves within some ten seconds or more, such as a field or a position."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +34,8 @@ class RerunOutcome:
     """Streams of the simulation that are not compared."""
     expectations: Sequence[ExpectationComparison] = ()
     """Checks that were judged in both runs."""
+    is_exact: bool = False
+    """Whether nothing of the recorded run was rounded and played back: then no difference is small."""
 
     @property
     def differing_expectations(self) -> list[ExpectationComparison]:
@@ -109,7 +107,7 @@ class RerunOutcome:
             for name, field in one.fields.items()
             if field.different
             and not self._is_unlike(f"{one.table}.{name}")
-            and not self._is_rounding(one.table, field)
+            and not self._is_rounding(one.table, name)
         ]
         for alone, where in ((one.only_a, "on record"), (one.only_b, "in the rerun")):
             if alone.count:
@@ -124,27 +122,16 @@ class RerunOutcome:
                 told.append(f"{', '.join(names)} only {where}")
         return told
 
-    def _is_rounding(self, table: str, field: FieldDifference) -> bool:
-        """Tell whether values differ by no more than what follows from times in whole microseconds."""
-        if not field.is_number or field.null_in_one:
+    def _is_rounding(self, table: str, name: str) -> bool:
+        """Tell whether values differ by no more than what was rounded explains, in the records of each source."""
+        if self.is_exact:
             return False
-        if field.field.unit == "s":
-            return field.max <= SAME_TIME_S
-        largest = 0.0
-        for key, recorded in self.streams.a.streams.items():
-            if key[0] != table:
-                continue
-            # Of a vector's elements the largest counts: they have a unit in common.
-            names = [
-                one.name
-                for one in recorded.fields
-                if one.unit == field.field.unit and one.kind == "float"
-            ]
-            for columns in recorded.batches(names):
-                for name in names:
-                    values = np.abs(as_array(columns[name]))
-                    largest = max(largest, float(np.nanmax(values, initial=0.0)))
-        return field.max <= ROUNDING_RATIO * largest
+        found = [
+            (one.fields[name], self.streams.a.streams[table, one.source])
+            for one in self.streams.streams
+            if one.table == table and name in one.fields and one.fields[name].different
+        ]
+        return all(is_rounding(field, recorded) for field, recorded in found)
 
     def _is_unlike(self, name: str) -> bool:
         is_device = name.startswith("device_")  # compared by their own rules

@@ -49,6 +49,8 @@ class RerunScenario:
     """Words of actions that are not carried over."""
     ends: Mapping[str, float] = field(default_factory=dict)
     """Agents that ended before others, as the run was cut off or they were killed, each with the time of its last tick, s."""
+    is_exact: bool = False
+    """Whether nothing on record, where times are rounded, is played back: it was in lockstep, without devices, and flies by itself."""
 
 
 def make_rerun(recorded: FlownRun) -> RerunScenario:
@@ -80,6 +82,7 @@ def make_rerun(recorded: FlownRun) -> RerunScenario:
         left_out=tuple(carried.left_out),
         ends=_ends(recorded),
         unlike=() if config.time.is_lockstep else tuple(told["unlike"]),
+        is_exact=config.time.is_lockstep and not recorded.devices and told["flies_as_it_was"],
     )
 
 
@@ -128,7 +131,7 @@ def _checked(recorded: FlownRun, values: Mapping[str, Any], carried: CarriedOver
 
 def _ask_simulation(config: RunConfig, run: Path) -> Mapping[str, Any]:
     """
-    Return the parameters of the rerun as plain values, remarks, and streams that are not compared.
+    Return the parameters of the rerun as plain values, whether they are those of the run, remarks, and streams that are not compared.
 
     Raises:
         MadnsError: The simulation cannot be asked.
@@ -140,7 +143,8 @@ def _ask_simulation(config: RunConfig, run: Path) -> Mapping[str, Any]:
         tell(f"importing {config.simulation}")
         simulation = resolve(config.simulation, folder)
         if simulation.rerun is None:
-            return {"parameters": to_mapping(config.parameters), "remarks": [], "unlike": []}
+            own = to_mapping(config.parameters)
+            return {"parameters": own, "remarks": [], "unlike": [], "flies_as_it_was": True}
         parameters = parse_parameters(simulation, config.parameters)
         tell(f"rerun() of {config.simulation}")
         found = ask_rerun(
@@ -154,6 +158,7 @@ def _ask_simulation(config: RunConfig, run: Path) -> Mapping[str, Any]:
             "parameters": to_mapping(found.parameters),
             "remarks": list(found.remarks),
             "unlike": list(found.unlike),
+            "flies_as_it_was": bool(found.parameters == parameters),
         }
 
     if is_shipped(config.simulation):

@@ -2,7 +2,8 @@
 Matching of the records of two streams: by tick, or by time. Pure numpy.
 
 Both streams are read side by side, so that neither is ever held whole: what is held is a batch of each
-and the rows between the ends of the two.
+and the rows between the ends of the two. Keys that go back by more than was seen before they were settled are told
+(`KeyWentBackError`): with the order of both streams, learnt from all of their keys, no record is settled too early.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.analysis.record_order import RecordOrder, by_whom, gone_back
 from madns_runtime.analysis.values import Floats
 from madns_runtime.recording.columns import joined_column
 
@@ -21,6 +23,13 @@ Indices = NDArray[np.int64]
 Columns = dict[str, NDArray[Any]]
 FINEST = 1e-3
 """Share of the tolerance that keys have to be told apart by, however far some of them are away."""
+ROWS_HELD_MAX = 1 << 19
+"""Records of both streams that wait for others; beyond, what lies behind the newest of both waits no longer."""
+Orders = tuple[RecordOrder, RecordOrder]
+
+
+class KeyWentBackError(Exception):
+    """A record came behind others of keys so far beyond its own that its partner may be settled already."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,26 +65,46 @@ class Matched:
     only_b: Rows
 
 
-def match(a: Iterable[Rows], b: Iterable[Rows], *, tolerance: float) -> Iterator[Matched]:
+def match(
+    a: Iterable[Rows],
+    b: Iterable[Rows],
+    *,
+    tolerance: float,
+    orders: Orders | None = None,
+    must_wait: bool = False,
+) -> Iterator[Matched]:
     """
-    Match two streams whose keys grow.
+    Match two streams whose keys grow, or go back as *orders* tells.
 
     Records are pairs if each is the other's nearest and they are no further apart than *tolerance*.
-    Several records of one key and whom are matched in the order of their ranks, or else in their own. A record that comes after others
-    with keys far beyond its own is not found by its partner, and both count as alone.
+    Several records of one key and whom are matched in the order of their ranks, or else in their own. Without *orders* a record waits
+    for others as long as keys of its stream went back so far; one that comes later still is not found by its partner, and
+    both count as alone.
 
     Args:
         a: Batches of one stream, at least one.
         b: Batches of the other, at least one.
         tolerance: Largest distance of a pair's keys.
+        orders: Orders of both, as all of their keys tell; None where they are not known.
+        must_wait: Whether a record that comes too late is an error.
+
+    Raises:
+        KeyWentBackError: One came too late, and it must not.
     """
-    sides = (_Side(a), _Side(b))
-    first, second = sides
+    of_a, of_b = orders or (None, None)
+    first, second = sides = (_Side(a, of_a), _Side(b, of_b))
+    settled_to = -np.inf
     while not (first.has_ended and second.has_ended):
-        behind = min((s for s in sides if not s.has_ended), key=lambda side: side.newest)
+        going_on = [side for side in sides if not side.has_ended]
+        # Where keys go back it is not the newest one that tells which of them is behind.
+        behind = min(going_on, key=lambda s: s.newest if orders is None else len(s.held))
         behind.read()
-        settled = _settle(first, second, min(side.frontier for side in sides), tolerance)
+        if must_wait and orders is None and behind.lowest < settled_to:
+            raise KeyWentBackError
+        frontiers = _Frontiers(sides)
+        settled = _settle(first, second, frontiers, tolerance)
         if any(map(len, (settled.a, settled.only_a, settled.only_b))):
+            settled_to = max(settled_to, frontiers.of_all)
             yield settled
 
 
@@ -100,11 +129,16 @@ def pair_up(a: Rows, b: Rows, tolerance: float) -> tuple[Indices, Indices]:
 class _Side:
     """One stream as far as it is read."""
 
-    def __init__(self, batches: Iterable[Rows]) -> None:
+    def __init__(self, batches: Iterable[Rows], order: RecordOrder | None) -> None:
         self._batches = iter(batches)
         self._next: Rows | None = next(self._batches)
         self.held: Rows = self._next.take(np.empty(0, dtype=np.int64))
-        self.newest = -np.inf
+        self.order = order
+        self.newest = self.lowest = -np.inf
+        """Largest key of all that is read, and smallest of the batch that was read last."""
+        self._back = 0.0 if order is None else order.back
+        self._newest_of: dict[str, float] = {}
+        self._left = {} if order is None else dict(order.counts)
 
     @property
     def has_ended(self) -> bool:
@@ -113,45 +147,83 @@ class _Side:
 
     @property
     def frontier(self) -> float:
-        """No record to come has a key below this one."""
-        return np.inf if self.has_ended else self.newest
+        """Key that no record to come lies below, as far as keys went back until now, or will."""
+        return np.inf if self.has_ended else self.newest - self._back
+
+    def frontier_of(self, name: str) -> float:
+        """Return the key that no record to come of one whom lies below; only of a stream whose order is known."""
+        if self.order is None or self.has_ended or not self._left.get(name):
+            return np.inf
+        own = self._newest_of.get(name, -np.inf) - self.order.back_of_one
+        return max(self.frontier, own)
 
     def read(self) -> None:
         """Take one batch more."""
         batch = self._next
         assert batch is not None
         self.held = batch if not len(self.held) else _join((self.held, batch))
-        if len(batch):
-            self.newest = max(self.newest, float(np.nanmax(batch.keys, initial=-np.inf)))
+        self.newest, back = gone_back(batch.keys, self.newest)
+        self._back = max(self._back, back)
+        is_key = np.isfinite(batch.keys)
+        self.lowest = float(np.min(batch.keys, initial=np.inf, where=is_key))
+        if self.order is not None:
+            for name, keys in by_whom(batch.keys, batch.who):
+                self._left[name] -= len(keys)
+                self._newest_of[name], _ = gone_back(keys, self._newest_of.get(name, -np.inf))
         self._next = next(self._batches, None)
 
 
-def _settle(a: _Side, b: _Side, frontier: float, tolerance: float) -> Matched:
+class _Frontiers:
+    """Keys that no record to come lies below, in either stream."""
+
+    def __init__(self, sides: tuple[_Side, _Side]) -> None:
+        self._sides = sides
+        self._is_by_whom = all(side.order is not None for side in sides)
+        self.of_all = min(side.frontier for side in sides)
+        if sum(len(side.held) for side in sides) > ROWS_HELD_MAX:
+            self._is_by_whom = False
+            self.of_all = min((s.newest for s in sides if not s.has_ended), default=np.inf)
+
+    def of(self, rows: Rows) -> Floats:
+        """Return the frontier of each row, shape (N,) or (1,)."""
+        if not self._is_by_whom or not len(rows):
+            return np.array([self.of_all])
+        names, code = np.unique(rows.who.astype(str), return_inverse=True)
+        found = [min(side.frontier_of(name) for side in self._sides) for name in names.tolist()]
+        return np.array(found)[code]
+
+
+def _settle(a: _Side, b: _Side, frontiers: _Frontiers, tolerance: float) -> Matched:
     """Match what is held, and keep what a record to come could still belong to."""
     rows_a, rows_b = a.held, b.held
-    in_a, in_b = pair_up(rows_a, rows_b, tolerance)
-    # Nearest of all is only sure where whatever comes lies further away.
-    sure = frontier - tolerance
-    is_sure = np.maximum(rows_a.keys[in_a], rows_b.keys[in_b]) <= sure
-    in_a, in_b = in_a[is_sure], in_b[is_sure]
-    alone_a, keep_a = _others(rows_a, in_a, sure)
-    alone_b, keep_b = _others(rows_b, in_b, sure)
+    # Nearest of all is only sure where whatever comes lies further away. A key that is not a number will never find a partner.
+    is_over_a, is_over_b = (
+        ~(rows.keys > frontiers.of(rows) - tolerance) for rows in (rows_a, rows_b)
+    )
+    in_a = in_b = np.empty(0, dtype=np.int64)
+    if is_over_a.any() or is_over_b.any():
+        in_a, in_b = pair_up(rows_a, rows_b, tolerance)
+    is_sure = is_over_a[in_a] & is_over_b[in_b]
+    # Whoever has found a partner of which it is not sure yet is not alone: it waits with it.
+    alone_a, keep_a = _others(is_over_a, in_a, is_sure)
+    alone_b, keep_b = _others(is_over_b, in_b, is_sure)
     a.held, b.held = rows_a.take(keep_a), rows_b.take(keep_b)
     return Matched(
-        a=rows_a.take(in_a),
-        b=rows_b.take(in_b),
+        a=rows_a.take(in_a[is_sure]),
+        b=rows_b.take(in_b[is_sure]),
         only_a=rows_a.take(alone_a),
         only_b=rows_b.take(alone_b),
     )
 
 
-def _others(rows: Rows, paired: Indices, sure: float) -> tuple[NDArray[np.bool_], Any]:
+def _others(
+    is_over: NDArray[np.bool_], paired: Indices, is_sure: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return masks of what is surely alone, and of what is kept."""
-    is_left = np.ones(len(rows), dtype=np.bool_)
-    is_left[paired] = False
-    # A key that is not a number will never find a partner.
-    is_over = ~(rows.keys > sure)
-    return is_left & is_over, is_left & ~is_over
+    is_alone, is_kept = is_over.copy(), ~is_over
+    is_alone[paired] = False
+    is_kept[paired] = ~is_sure
+    return is_alone, is_kept
 
 
 def _on_one_line(a: Rows, b: Rows, tolerance: float) -> tuple[Floats, Floats]:

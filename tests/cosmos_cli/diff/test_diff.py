@@ -176,6 +176,27 @@ def test_different_tick_rates_are_matched_by_time_and_said(make, capsys):
     assert state["fields"]["x_m"]["max"] < 1e-6  # the same orbit at the same instants
 
 
+def record_path(made):
+    """Record a path by ticks alone, of which only the rate tells the times."""
+    fields = (Field("tick", "", "int"), Field("x_m", "m"))
+    recorder = made.recorder("agents/agent-01", "agent-01", StreamSchema("path", fields))
+    for tick in range(20):
+        recorder.record("path", (tick, 7.0 * tick))
+    recorder.close()
+
+
+def test_the_same_ticks_at_another_rate_are_other_instants(make, capsys):
+    make(record_path), make(record_path, ticks=TICKS // 2, tick_hz=5.0)
+
+    code, document = diff(capsys, "1", "2", "--streams", "path", "--expect-same")
+
+    path = streams_of(document)["path"]
+    assert (code, document["identical"]) == (1, False)
+    assert (path["by"], path["matched"], path["identical"]) == ("time", 10, False)
+    assert (path["only_a"]["count"], path["only_b"]["count"]) == (10, 10)
+    assert path["fields"]["x_m"]["different"] == 9
+
+
 @pytest.mark.parametrize("table", ["as it is", "gone"])
 @pytest.mark.parametrize(
     ("fields", "told"),
@@ -410,6 +431,23 @@ def test_records_without_a_time_are_matched_among_those_of_the_agents_that_are_c
     ranks = streams_of(document)["host_ranks"]
     assert (ranks["matched"], ranks["only_b"]["count"]) == (20, 0)
     assert diff(capsys, "1", "2", "--streams", "ranks", "--expect-same")[0] == 1
+
+
+@pytest.mark.parametrize("table", ["as it is", "gone"])
+def test_of_a_hosts_identical_records_those_of_chosen_agents_alone_are_counted(make, capsys, table):
+    for _ in range(2):
+        made = make(lambda made: record_ranks(made, others=2))
+        if table == "gone":
+            (made.run.tables / "host_ranks.parquet").unlink()
+
+    code, document = diff(
+        capsys, "1", "2", "--streams", "ranks", "--agents", "agent-01", "--expect-same"
+    )
+
+    ranks = streams_of(document)["host_ranks"]
+    assert (code, document["identical"], ranks["identical"]) == (0, True, True)
+    assert (ranks["rows"], ranks["matched"]) == ([20, 20], 20)
+    assert diff(capsys, "1", "2", "--streams", "ranks")[1]["streams"][0]["matched"] == 60
 
 
 def record_device(made, value):

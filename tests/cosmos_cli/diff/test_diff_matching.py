@@ -117,6 +117,16 @@ def test_a_nearer_record_of_a_later_batch_is_waited_for():
     assert (found["a"], found["b"], found["only_b"]) == ([1.0, 2.0], [1.1, 2.0], [0.6])
 
 
+def test_a_record_waits_with_the_partner_that_it_has_found():
+    a = [rows([1.0]), rows([1.7]), rows([9.0])]
+    b = [rows([1.3]), rows([3.0]), rows([9.0])]
+
+    found = settled(match(a, b, tolerance=0.5))
+
+    assert (found["a"], found["b"]) == ([1.0, 9.0], [1.3, 9.0])
+    assert (found["only_a"], found["only_b"]) == ([1.7], [3.0])
+
+
 def test_huge_streams_are_held_in_small_part():
     count, size, read, done, held = 200_000, 1000, 0, 0, []
 
@@ -217,15 +227,50 @@ def test_whole_numbers_far_apart_differ_by_what_lies_between():
     assert found.max == 2.0**64
 
 
-def test_texts_that_are_json_nested_without_end_differ():
-    found = FieldDifference(Field("text", "", "str"))
-    left, right = np.empty(1, dtype=object), np.empty(1, dtype=object)
-    left[:], right[:] = ["[" * 5000], ["[" * 5001]
+@pytest.mark.parametrize(
+    ("kind", "left", "right", "expected"),
+    [
+        ("str", '{"on": 1}', '{"on": true}', 1),
+        ("str", "[1]", "[1.0]", 1),
+        ("str", '{"a": 1, "b": 2}', '{"b": 2, "a": 1}', 1),
+        ("str", "[1]", "[1]", 0),
+        ("str", [1, 2], "[1, 2]", 0),  # what is no text is one in a table
+        ("json", {"on": 1}, {"on": True}, 1),
+        ("json", [0, "a"], [False, "a"], 1),
+        ("json", '{"on": 1}', '{"on": true}', 1),
+        ("json", {"x": 1, "y": [2.0]}, '{"y": [2], "x": 1.0}', 0),
+        ("json", 2**53 + 1, float(2**53), 1),
+        ("json", 1.5, "1.5", 0),
+        ("json", True, "true", 0),
+        ("json", "word", "word", 0),
+        ("json", "word", "other", 1),
+        ("json", None, "null", 1),
+        ("json", None, None, 0),
+        ("json", float("inf"), "Infinity", 0),
+        ("bool", True, True, 0),
+        ("bool", True, False, 1),
+        ("bool", True, 1, 1),
+        ("bool", None, False, 1),
+    ],
+)
+def test_values_that_are_no_numbers_are_the_same_as_their_kind_says(kind, left, right, expected):
+    found = FieldDifference(Field("value", "", kind))
+    sides = []
+    for value in (left, right):
+        column = np.empty(1, dtype=object)
+        column[:] = [value]
+        sides.append(Rows(keys=np.zeros(1), who=np.zeros(1), columns={"value": column}))
 
-    found.add(
-        Rows(keys=np.zeros(1), who=np.zeros(1), columns={"text": left}),
-        Rows(keys=np.zeros(1), who=np.zeros(1), columns={"text": right}),
-    )
+    found.add(*sides)
+
+    assert found.different == expected
+
+
+@pytest.mark.parametrize("kind", ["str", "json"])
+def test_texts_nested_too_deep_to_be_read_differ(kind):
+    found = FieldDifference(Field("value", "", kind))
+
+    found.add(rows([0, 1], value=["[" * 5000, "["]), rows([0, 1], value=["[" * 5001, "["]))
 
     assert found.different == 1
 
@@ -260,6 +305,18 @@ def test_records_are_paired_by_tick_by_time_or_by_their_order():
     words = [Field("tick", "", "str"), Field("t_s", "", "json"), Field("value")]
     assert choose_pairing(words, words, same).by == "order"
     assert choose_pairing([TICK], words, same).by == "tick"
+
+
+def test_a_packet_counts_as_a_tick_only_where_nothing_tells_the_time():
+    packet, sent = Field("packet", "", "int"), Field("sent_s", "s")
+
+    without = choose_pairing([packet], [packet], (10.0, 10.0))
+    timed = choose_pairing([packet, sent, AGENT], [packet, sent, AGENT], (10.0, 5.0))
+    ticked = choose_pairing([packet, sent, TICK], [packet, sent, TICK], (10.0, 10.0))
+
+    assert (without.by, without.column) == ("tick", "packet")
+    assert (timed.by, timed.column, timed.scales) == ("time", "sent_s", (1.0, 1.0))
+    assert (ticked.by, ticked.column) == ("tick", "tick")
 
 
 def test_settings_differ_by_dotted_key():
