@@ -131,10 +131,12 @@ def counter(shape: Shape, seconds: float, *settings: str) -> dict[str, float]:
         lateness = read_column(agents.glob("*/ticks.jsonl"), 1)
         round_trips = read_column(agents.glob("*/round_trips.jsonl"), 2)
         timing = run.result["timing"]
+        late = [row for path in agents.glob("*/late_ticks.jsonl") for row in read_rows(path)]
         return {
             **figures_of(timing["ticks"], round_trips, lateness),
             **run.figures(),
             "missed": timing["missed"],
+            "missed_by_theft": sum(row[2] for row in late if row[3] == "stolen"),
             "late": timing["late"],
             "causes": timing["causes"],  # type: ignore[dict-item]
         }
@@ -142,12 +144,13 @@ def counter(shape: Shape, seconds: float, *settings: str) -> dict[str, float]:
 
 def read_column(paths: Iterator[Path], column: int) -> np.ndarray:
     """Return one field of all records of some files."""
-    values: list[float] = []
-    for path in paths:
-        with path.open("rb") as lines:
-            # Without a stream's first and last line.
-            values.extend(json.loads(line)[column] for line in lines if line.startswith(b"["))
-    return np.array(values, dtype=float)
+    return np.array([row[column] for path in paths for row in read_rows(path)], dtype=float)
+
+
+def read_rows(path: Path) -> Iterator[list[Any]]:
+    """Yield the records of a stream, without its first and last line."""
+    with path.open("rb") as lines:
+        yield from (json.loads(line) for line in lines if line.startswith(b"["))
 
 
 def watch(run: subprocess.Popen[bytes]) -> tuple[dict[str, float], float]:

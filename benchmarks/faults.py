@@ -4,8 +4,8 @@ Two hundred faults of twenty kinds, inserted on purpose, and what became of the 
     python benchmarks/faults.py [--each 10] [--kinds kill,hang] [--seed 1] [-i INVENTORY] [--json]
 
 Each kind is one run of twelve agents in real time, on loopback or on the machines of an inventory (such as a virtual
-tower's, where signals go by `cosmos exec`), with one fault of it after the other. A fault is survived if the run is complete and nobody is lost whom
-no fault named; named if the host's events, or its verdict, say whom it befell; the seconds until then are of the
+tower's, where signals go by `cosmos exec`), with one fault of it after the other. A fault is survived if it took effect (ticks left out by
+who hangs or is slow; messages lost, late or doubled), the run is complete and nobody is lost whom no fault named; named if the host's events, or its verdict, say whom it befell; the seconds until then are of the
 run's own events. Bytes unaccounted are those of record files that neither the manifest nor a loss that is named
 explains. A run that has not ended in time is a hang; a process of it that lives on, or a file half written, is a
 leftover. The exit code is 1 if any fault was not survived or not named, or any of the last three
@@ -27,6 +27,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,7 @@ ROOT = Path(__file__).parents[1]
 SIMULATION = ROOT / "tests/harness/fault_simulation.py"
 AGENTS = 12
 """Two of them are never touched: a run that has lost everybody ends."""
+TICK_HZ = 10
 FIRST_S, EVERY_S, FOR_S = 2.0, 1.5, 1.0
 EVERY_ON_BOARDS_S = 3.0
 """Between signals that are sent by a login."""
@@ -47,6 +50,8 @@ PATIENCE_S = 120.0
 COMPLETE = (0, 4, 5)
 """Exit codes of runs that came to their end."""
 LOST = "lost"
+ALTERED = ("lost", "late", "doubled", "double_discarded")
+"""Counts under `faults` of messages that a fault has altered."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,7 +183,7 @@ class FaultRun:
             "seed": self.options.seed,
             "agents": {
                 "count": AGENTS,
-                "tick_hz": 10,
+                "tick_hz": TICK_HZ,
                 "per_process": kind.per_process,
                 "restarts_max": 0 if kind.per_process > 1 else 5,
             },
@@ -226,6 +231,7 @@ class FaultRun:
         survived = len(self.victims) if is_complete and lost <= expected else 0
         if self.kind.number is None and result.get("exit_code") != 0:
             survived = 0
+        survived = min(survived, self._felt(run, result) if result["run"] else 0)
         return KindOutcome(
             kind=self.kind.name,
             faults=len(self.victims),
@@ -238,6 +244,16 @@ class FaultRun:
             + len(list(self.folder.rglob("*.part"))),
             verdict=str(result.get("verdict")),
         )
+
+    def _felt(self, run: Path, result: Mapping[str, Any]) -> int:
+        """Return how many of the faults had an effect of their own, or one for each could have had; a loss is one."""
+        if self.kind.action in ("hang", "slow"):
+            return sum(map(partial(has_gap, run), self.victims, self.times_s))
+        if self.kind.is_loss:
+            return len(self.victims)
+        counts = result.get("faults", {}).values()
+        altered = (each.get(name, 0) for each in counts for name in ALTERED)
+        return min(len(self.victims), sum(altered))
 
     def _named(self, run: Path) -> Iterator[float]:
         """Yield the time from each fault to the host's word of it, s."""
@@ -272,6 +288,14 @@ class FaultRun:
             now_utc = time.time_ns() * 1e-9
             if self.processes.signal(agent, self.kind.number):
                 self.sent_utc.append(now_utc)
+
+
+def has_gap(run: Path, agent: str, at_s: float) -> bool:
+    """Tell whether an agent left ticks out between a fault's begin and a second behind its end."""
+    path = run / f"agents/{agent}/steps.jsonl"
+    rows = [json.loads(line) for line in path.read_text().splitlines() if line.startswith("[")]
+    ticks = [row[1] for row in rows if at_s - 0.2 <= row[1] / TICK_HZ <= at_s + FOR_S + 1.0]
+    return any(later - tick > 1 for tick, later in pairwise(ticks))
 
 
 def is_word_of(event: Mapping[str, Any], agent: str, kind: FaultKind) -> bool:

@@ -125,8 +125,8 @@ def slow_read(arguments: argparse.Namespace) -> list[dict[str, Any]]:
                 figures = tick_figures(run)
                 if mode != "none":
                     ages_us = records(run, "agents/*/looks.jsonl")[:, 0]
-                    figures["age p50, ms"] = float(np.percentile(ages_us, 50)) / 1e3
-                    figures["age max, ms"] = float(ages_us.max()) / 1e3
+                    figures["age since its read, p50, ms"] = float(np.percentile(ages_us, 50)) / 1e3
+                    figures["age since its read, max, ms"] = float(ages_us.max()) / 1e3
                 rows.add(what, figures)
     return rows.all()
 

@@ -73,7 +73,8 @@ class Reader(AgentSimulation):
 
     def inline(self, tick):
         time.sleep(READ_S)
-        return READ_S * 1e6, tick.index
+        taken_s = time.monotonic()  # as in the device's process: at the end of the read
+        return (time.monotonic() - taken_s) * 1e6, tick.index
 
     def slow(self, tick):
         reading = self.context.hardware["slow"]["time"]

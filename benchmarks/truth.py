@@ -55,7 +55,8 @@ SLOW_ROUNDS_MAX = 3
 SLOW_MS = 500.0
 """A contender that takes longer runs SLOW_ROUNDS_MAX times only."""
 DEFAULT = "scipy"
-RIVAL = "basilisk 0.1 s, rigid"
+RIVALS = ("basilisk 0.1 s, point", "basilisk 0.1 s, rigid")
+"""Point masses do the same work; spacecraft, as the thesis flew them, integrate their rotation beside."""
 ALONE_ROUNDS = 500
 GOALS = (
     ("at 93 vehicles", 93, 50.0),
@@ -266,11 +267,13 @@ def print_goals(
     print("\nGoals")
     for where, count, least in GOALS:
         row = times_ms.get(count, {})
-        if RIVAL in row:
-            ratio = statistics.median(row[RIVAL]) / statistics.median(row[DEFAULT])
-            judge(f"default over {RIVAL}, {where}: >= {least:g}x", f"{ratio:.0f}x", ratio >= least)
-        else:
-            print(f"  not measured  default over {RIVAL}, {where}")
+        for rival in RIVALS:
+            if rival in row:
+                ratio = statistics.median(row[rival]) / statistics.median(row[DEFAULT])
+                goal = f"default over {rival}, {where}: >= {least:g}x"
+                judge(goal, f"{ratio:.0f}x", ratio >= least)
+            else:
+                print(f"  not measured  default over {rival}, {where}")
     worst_m = max(agreement.values(), default=math.nan)
     limit = f"agreement over 4 h: <= {AGREEMENT_M:g} m"
     judge(limit, f"{worst_m:.1e} m", worst_m <= AGREEMENT_M)
