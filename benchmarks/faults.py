@@ -4,8 +4,8 @@ Two hundred faults of twenty kinds, inserted on purpose, and what became of the 
     python benchmarks/faults.py [--each 10] [--kinds kill,hang] [--seed 1] [-i INVENTORY] [--json]
 
 Each kind is one run of twelve agents in real time, on loopback or on the machines of an inventory (such as a virtual
-tower's, where signals go by `cosmos exec`), with one fault of it after the other. A fault is survived if it took effect (ticks left out by
-who hangs or is slow; messages lost, late or doubled), the run is complete and nobody is lost whom no fault named; named if the host's events, or its verdict, say whom it befell; the seconds until then are of the
+tower's, where signals go by `cosmos exec`), with one fault of it after the other. A fault is survived if it took effect (ticks left out,
+long steps, messages lost, late or doubled), the run is complete and nobody is lost whom no fault named; named if the host's events, or its verdict, say whom it befell; the seconds until then are of the
 run's own events. Bytes unaccounted are those of record files that neither the manifest nor a loss that is named
 explains. A run that has not ended in time is a hang; a process of it that lives on, or a file half written, is a
 leftover. The exit code is 1 if any fault was not survived or not named, or any of the last three
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import signal
 import statistics
@@ -75,7 +76,7 @@ KINDS = (
     FaultKind(name="kill one of five in a process", action="kill", per_process=5, is_loss=True),
     FaultKind(name="restart", action="restart", for_s=None, is_loss=True),
     FaultKind(name="hang", action="hang"),
-    FaultKind(name="slow", action="slow", parameters={"factor": 4}),
+    FaultKind(name="slow", action="slow", parameters={"factor": 1000}),  # of a step of some 50 us
     FaultKind(name="lose all messages", action="lose_messages"),
     FaultKind(name="lose a fifth", action="lose_messages", parameters={"probability": 0.2}),
     FaultKind(
@@ -247,8 +248,8 @@ class FaultRun:
 
     def _felt(self, run: Path, result: Mapping[str, Any]) -> int:
         """Return how many of the faults had an effect of their own, or one for each could have had; a loss is one."""
-        if self.kind.action in ("hang", "slow"):
-            return sum(map(partial(has_gap, run), self.victims, self.times_s))
+        if seen := {"hang": has_gap, "slow": has_long_step}.get(self.kind.action):
+            return sum(map(partial(seen, run), self.victims, self.times_s))
         if self.kind.is_loss:
             return len(self.victims)
         counts = result.get("faults", {}).values()
@@ -292,10 +293,20 @@ class FaultRun:
 
 def has_gap(run: Path, agent: str, at_s: float) -> bool:
     """Tell whether an agent left ticks out between a fault's begin and a second behind its end."""
-    path = run / f"agents/{agent}/steps.jsonl"
-    rows = [json.loads(line) for line in path.read_text().splitlines() if line.startswith("[")]
-    ticks = [row[1] for row in rows if at_s - 0.2 <= row[1] / TICK_HZ <= at_s + FOR_S + 1.0]
+    ticks = [tick for _, tick in near(run / f"agents/{agent}/steps.jsonl", 1, at_s)]
     return any(later - tick > 1 for tick, later in pairwise(ticks))
+
+
+def has_long_step(run: Path, agent: str, at_s: float) -> bool:
+    """Tell whether a step meanwhile took more than a tenth of the period, of which its margin is the rest."""
+    margins_us = [row[2] for row in near(run / f"agents/{agent}/ticks.jsonl", 0, at_s)]
+    return min(margins_us, default=math.inf) < 0.9e6 / TICK_HZ
+
+
+def near(path: Path, column: int, at_s: float) -> list[list[Any]]:
+    """Return the records of a stream about a fault's time, by the column of their tick."""
+    rows = [json.loads(line) for line in path.read_text().splitlines() if line.startswith("[")]
+    return [row for row in rows if at_s - 0.2 <= row[column] / TICK_HZ <= at_s + FOR_S + 1.0]
 
 
 def is_word_of(event: Mapping[str, Any], agent: str, kind: FaultKind) -> bool:
