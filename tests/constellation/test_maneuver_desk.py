@@ -33,7 +33,7 @@ RIGID = Vehicle(
 
 
 def desk(vehicle=PLAIN, *, can_maneuver=True, knot_s=1.0, **settings):
-    settings = Maneuvers(propagation_s=0.02, network_s=0.03, **settings)
+    settings = Maneuvers(**{"propagation_s": 0.02, "network_s": 0.03, **settings})
     rules = Rules(
         settings=settings,
         can_maneuver=can_maneuver,
@@ -86,6 +86,17 @@ def test_an_agent_that_lives_behind_has_its_time_later_too():
 def test_a_time_that_means_a_knot_is_the_knots():
     assert desk().decide(0, command(20.00000005), 10.0).effect.start_s == 20.0
     assert desk().decide(0, command(20.3), 10.0).effect.start_s == 20.3
+
+
+@pytest.mark.parametrize("at_s", [0.0, 10.0])
+def test_a_late_command_is_postponed_to_a_later_tick_however_little_time_is_allowed(at_s):
+    # Truth has no knot before time 0 from which it could begin anew.
+    hasty = desk(propagation_s=1e-10, network_s=0.0)
+
+    taken = hasty.decide(0, command(at_s, commanded_s=at_s), at_s)
+
+    assert (taken.status, taken.at_s) == ("postponed", at_s + 0.1)
+    assert taken.effect.start_s == at_s + 0.1
 
 
 def test_late_commands_are_refused_where_the_scenario_says_so():

@@ -300,6 +300,17 @@ def magnetise(
     return Magnetisation(dipole_a_m2=scaled((x, y, z), factor), limits=limits)
 
 
+Given = Burn | WheelTurn | Magnetisation
+"""Effect of a command on an actuator."""
+
+
+def vector_of(given: Given) -> Vector:
+    """Return the change of velocity, torque or dipole that an actuator gives."""
+    if isinstance(given, Burn):
+        return given.vector
+    return given.torque_n_m if isinstance(given, WheelTurn) else given.dipole_a_m2
+
+
 class ActuatorFailures:
     """Weak thrusters and wheels without torque of all vehicles; several failures of one may be in force at a time."""
 
