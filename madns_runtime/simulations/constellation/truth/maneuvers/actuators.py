@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from madns_runtime.simulations.constellation.command_numbers import COMMANDS_MAX
 from madns_runtime.simulations.constellation.equipment import (
     Magnetorquers,
     ReactionWheels,
@@ -36,8 +37,6 @@ DIPOLE_A_M2_MIN = 1e-12
 """Less turns nothing."""
 ARC_S_MIN = 0.01
 """A burn that is over sooner is an impulse; a torque or a dipole is not given for less, s."""
-COMMANDS_MAX = 2**31
-"""Numbers of commands are below it."""
 WHEELS_FAILED = "the wheels have failed"
 
 
@@ -110,7 +109,7 @@ def number_fault(command: Command) -> str:
     if not all(map(math.isfinite, numbers)):
         return f"expected finite numbers, got {numbers}"
     if not 0 <= command.number < COMMANDS_MAX:
-        return f"expected a number from 0 on, got {command.number}"
+        return f"expected a number from 0 on below {COMMANDS_MAX}, got {command.number}"
     return ""
 
 
