@@ -70,9 +70,10 @@ class Tank:
     """
     Mass and propellant of one vehicle.
 
-    Burns are booked as they are accepted. The rocket equation makes the propellant of several depend on
-    the sum of their changes of velocity alone, so that what is left is right in whatever order they burn.
-    Until a burn is over the tank holds what is booked for it: see `left_kg`.
+    Burns are booked as they are accepted. By the rocket equation each multiplies the mass by a factor of its own, so
+    that what is left after all of them is right in whatever order they burn. Until a burn is over the tank holds
+    what is booked for it, see `left_kg`: that depends on the order of their times. One that is booked before others
+    of later times lifts more mass than they leave, and they less.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -84,9 +85,15 @@ class Tank:
 
     def book(self, burn: Burn, start_s: float, end_s: float, *, now_s: float) -> None:
         """Take off the propellant of a burn between two times, and forget those that are over now."""
+        waiting = [each for each in self._booked if each[1] > now_s]
+        self._booked, own_kg = [], burn.propellant_kg
+        for begins_s, ends_s, kg in waiting:
+            if begins_s > start_s:  # the vehicle is still as heavy, and lighter afterwards
+                own_kg += burn.burnt * kg
+                kg -= burn.burnt * kg  # noqa: PLW2901 - what is left of it
+            self._booked.append((begins_s, ends_s, kg))
+        self._booked.append((start_s, end_s, own_kg))
         self.burn(burn.propellant_kg)
-        self._booked = [each for each in self._booked if each[1] > now_s]
-        self._booked.append((start_s, end_s, burn.propellant_kg))
 
     def left_kg(self, t_s: float) -> float:
         """Return what the tank holds at *t_s*, not long ago or later: what burns booked until now have not burnt by then."""
