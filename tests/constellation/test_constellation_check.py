@@ -28,6 +28,16 @@ class G(FlightSoftware):
 """
 
 
+GROUNDED = [{"name": name, "altitude_km": 500} for name in ("ground", "ground:A")]
+TWINS = """IRIDIUM 8
+1 24792U 97020A   17066.30480103  .00000181  00000-0  57411-4 0  9993
+2 24792  86.4004   1.2813 0002235  84.4150 275.7300 14.34220922 38595
+IRIDIUM 8
+1 24793U 97020B   17066.29844670  .00000177  00000-0  56085-4 0  9996
+2 24793  86.4011   1.5611 0002185  85.6164 274.5281 14.34216531 38591
+"""
+
+
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "guidance.py").write_text(GUIDANCE)
@@ -178,6 +188,14 @@ FAULTS_OF_THE_BOARD = [
         },
         r"uplinks\[0\].to: no agent and no satellite is called 'agent-1'",
     ),
+    (
+        {"stations": [{"name": "A\x1b[31m", "latitude_deg": 0, "longitude_deg": 0}]},
+        r"stations\[0\].name: expected a name of at most \d+ printable characters, got ",
+    ),
+    (
+        {"satellites": {"keplerian": GROUNDED}, "crosslinks": {}},
+        r"satellites: no message reaches the satellite named 'ground' \(nor 1 more\): ",
+    ),
 ]
 
 
@@ -190,6 +208,34 @@ def test_faults_of_the_board_are_named_by_parameter(folder, rest, fault):
 
     assert len(found) == 1
     assert re.match(f"parameters.{fault}", found[0]), found[0]
+
+
+@pytest.mark.parametrize(
+    ("radio", "field"), [("crosslinks", "crosslinks"), ("stations", "stations")]
+)
+def test_an_agent_of_a_name_that_means_stations_is_refused_where_there_is_a_radio(
+    folder, radio, field
+):
+    stations = [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}]
+    given = {"crosslinks": {"crosslinks": {}}, "stations": {"stations": stations}}[radio]
+    names = ("ground", "grounded")
+
+    (fault,) = find_faults(parameters(**given), 2, folder, names=names)
+
+    assert fault.startswith(f"parameters.{field}: no message reaches the agent named 'ground': ")
+    assert find_faults(parameters(), 2, folder, names=names) == []
+
+
+def test_an_uplink_to_a_name_of_two_satellites_is_refused(folder):
+    (folder / "twins.tle").write_text(TWINS)
+    stations = [{"name": "A", "latitude_deg": 0, "longitude_deg": 0}]
+    uplinks = [{"at_s": 0, "to": to, "text": "x"} for to in ("agent-01", "IRIDIUM 8")]
+
+    found = faults(folder, satellites={"elements": "twins.tle"}, stations=stations, uplinks=uplinks)
+
+    assert found == [
+        "parameters.uplinks[1].to: 2 satellites are called 'IRIDIUM 8': name the agent"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,33 @@ def test_faults_are_named_by_parameter(mapping, agents, fault):
         raise ConfigurationError(faults[0])
 
 
+@pytest.mark.parametrize(
+    ("segments", "tick_hz", "duration_s", "fault"),
+    [
+        ({}, 1e-4, 45_000.0, "segments.buffer_s: expected at least 39.68 s, got 20 s: .*longer"),
+        ({"buffer_s": 40.0}, 1e-4, 45_000.0, None),
+        ({}, 1e-4, 4_000.0, None),  # the only tick is that of time 0
+        ({}, 0.0, 45_000.0, None),
+        (
+            {"buffer_s": 2000.0, "knot_s": 0.05},
+            1e-4,
+            45_000.0,
+            "segments.knot_s: expected at most 200000 knots .*got 270014 every 0.05 s",
+        ),
+        ({"buffer_s": 3600.0, "knot_s": 1800.0 / 49_999}, 0.05, 45_000.0, None),
+    ],
+)
+def test_an_agent_has_room_for_the_truth_between_two_ticks(segments, tick_hz, duration_s, fault):
+    faults = find_faults(
+        parameters(WALKER, segments=segments), 1, SCENARIOS, duration_s=duration_s, tick_hz=tick_hz
+    )
+
+    assert len(faults) == (fault is not None)
+    if fault is not None:
+        with pytest.raises(ConfigurationError, match=fault):
+            raise ConfigurationError(faults[0])
+
+
 def test_all_faults_come_at_once():
     faults = find_faults(
         parameters(

@@ -9,10 +9,8 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.device_view import ChannelReading
 from madns_runtime.simulations.constellation.actuation import Actuation, actuation_faults
 from madns_runtime.simulations.constellation.check import device_uses, find_faults
-from madns_runtime.simulations.constellation.vehicle.device_commands import (
-    DEVICE_NUMBER_FIRST,
-    DeviceCommands,
-)
+from madns_runtime.simulations.constellation.command_numbers import DEVICE_NUMBER_FIRST
+from madns_runtime.simulations.constellation.vehicle.device_commands import DeviceCommands
 
 BODY = {
     "inertia_kg_m2": [1.0, 1.2, 0.9],

@@ -17,6 +17,7 @@ from madns_runtime.simulations.constellation.equipment import Sensors
 from madns_runtime.simulations.constellation.flight.api import Reading
 from madns_runtime.simulations.constellation.flight.interface import c_header, content, frames
 from madns_runtime.simulations.constellation.flight.interface.answers import CommandRequest
+from madns_runtime.simulations.constellation.flight.interface.dialogue import Dialogue
 from madns_runtime.simulations.constellation.flight.interface.frames import Frames
 from madns_runtime.simulations.constellation.flight.interface.json_lines import JsonLines
 from madns_runtime.simulations.constellation.flight.interface.reports import SetupReport, TickReport
@@ -299,3 +300,18 @@ def test_an_array_without_axes_in_a_message_is_its_number(make):
     packets = make().tick(TickReport(t_s=0.1, messages=[message]))
 
     assert b'{"x":1.5,"y":[2.5]}' in b"".join(packets)
+
+
+def test_numbers_of_long_runs_are_counted_in_32_bits_from_the_first_one_on():
+    first = 2**33 + 5
+    result = replace(FULL.results[0], number=first + 1)
+    dialogue = Dialogue()
+
+    setup, *_ = dialogue.setup(replace(SETUP, first_number=first))
+    (told,) = (
+        said
+        for said in dialogue.tick(replace(FULL, results=(result,)))
+        if said.content is content.RESULT
+    )
+
+    assert (setup.values["first_number"], told.values["number"]) == (5, 6)

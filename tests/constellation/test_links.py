@@ -18,6 +18,7 @@ from madns_runtime.simulations.constellation.truth.radio.channel import (
     CROSSLINKS,
     OUTCOMES,
     CrosslinkMedium,
+    index_of_names,
 )
 
 RADIUS_M = 7_158_137.0
@@ -92,6 +93,14 @@ def test_message_takes_its_length_light_time_and_processing():
         event.arrives_s,
         PAYLOAD,
     )
+
+
+def test_a_name_of_two_satellites_means_none_of_them():
+    agents = ("v0", "v1", "v2", "SAT C")
+
+    index = index_of_names(agents, ("SAT A", "SAT B", "SAT A", "SAT B", "SAT C"))
+
+    assert index == {"v0": 0, "v1": 1, "v2": 2, "SAT C": 3}
 
 
 def test_messages_of_one_transmitter_wait_for_each_other():

@@ -32,12 +32,12 @@ RIGID = Vehicle(
 )
 
 
-def desk(vehicle=PLAIN, *, can_maneuver=True, knot_s=1.0, **settings):
-    settings = Maneuvers(propagation_s=0.02, network_s=0.03, **settings)
+def desk(vehicle=PLAIN, *, can_maneuver=True, knot_s=1.0, duration_s=100.0, **settings):
+    settings = Maneuvers(**{"propagation_s": 0.02, "network_s": 0.03, **settings})
     rules = Rules(
         settings=settings,
         can_maneuver=can_maneuver,
-        duration_s=100.0,
+        duration_s=duration_s,
         tick_hz=10.0,
         knot_s=knot_s,
         seed=5,
@@ -86,6 +86,17 @@ def test_an_agent_that_lives_behind_has_its_time_later_too():
 def test_a_time_that_means_a_knot_is_the_knots():
     assert desk().decide(0, command(20.00000005), 10.0).effect.start_s == 20.0
     assert desk().decide(0, command(20.3), 10.0).effect.start_s == 20.3
+
+
+@pytest.mark.parametrize("at_s", [0.0, 10.0])
+def test_a_late_command_is_postponed_to_a_later_tick_however_little_time_is_allowed(at_s):
+    # Truth has no knot before time 0 from which it could begin anew.
+    hasty = desk(propagation_s=1e-10, network_s=0.0)
+
+    taken = hasty.decide(0, command(at_s, commanded_s=at_s), at_s)
+
+    assert (taken.status, taken.at_s) == ("postponed", at_s + 0.1)
+    assert taken.effect.start_s == at_s + 0.1
 
 
 def test_late_commands_are_refused_where_the_scenario_says_so():
@@ -291,13 +302,51 @@ def test_the_tank_holds_what_is_booked_for_burns_that_wait():
     at = desk()
     last, first = (at.decide(0, command(at_s, number=n), 10.0) for n, at_s in ((0, 40), (1, 20)))
     booked_kg = last.used_kg + first.used_kg
+    first_kg = 100.0 * -math.expm1(-1.0 / (220.0 * 9.80665))
     drag = at.decide(0, command(30.0, 2, kind="ballistic", vector=(0.02, 0.0, 0.0)), 10.0)
 
     told = [at.execute(each).result(0, is_over=True) for each in (first, drag, last)]
 
     assert first.propellant_kg == pytest.approx(20.0 - booked_kg)  # as if it came after the other
-    left_kg = [20.0 - first.used_kg, 20.0 - first.used_kg, 20.0 - booked_kg]
+    left_kg = [20.0 - first_kg, 20.0 - first_kg, 20.0 - booked_kg]
     assert [each.propellant_kg for each in told] == pytest.approx(left_kg, abs=1e-12)
+
+
+@pytest.mark.parametrize("thrust_n", [None, 100.0])
+def test_the_tank_holds_what_burns_use_in_the_order_of_their_times(thrust_n):
+    # By Tsiolkovsky: 500 kg, of which 340 kg may burn, at 200 s; halves the mass, and two small ones before.
+    exhaust_m_s, begins_kg = 200.0 * 9.80665, 340.0
+    thruster = Thruster(isp_s=200.0, propellant_kg=begins_kg, thrust_n=thrust_n)
+    vehicle = Vehicle(mass_kg=500.0, thruster=thruster, ballistic_m2_kg_range=(0.01, 0.05))
+    at = desk(vehicle, duration_s=20_000.0)
+    half_m_s = exhaust_m_s * math.log(2.0)
+    burns = [(half_m_s, 12_000.0), (100.0, 500.0), (50.0, 3000.0)]
+    half, first, second = (
+        at.decide(0, command(at_s, n, vector=(m_s, 0.0, 0.0)), 10.0)
+        for n, (m_s, at_s) in enumerate(burns)
+    )
+    drag = at.decide(0, command(500.0, 3, kind="ballistic", vector=(0.02, 0.0, 0.0)), 10.0)
+
+    left_kg = [at.execute(each).propellant_kg for each in (first, drag, second, half)]
+
+    masses_kg = [500.0 * math.exp(-m_s / exhaust_m_s) for m_s in (100.0, 150.0, half_m_s + 150.0)]
+    during_kg = begins_kg - 500.0 + (500.0 + masses_kg[0]) / 2.0 if thrust_n else None
+    after_kg = [begins_kg - 500.0 + kg for kg in masses_kg]
+    drag_kg = after_kg[0] if during_kg is None else during_kg
+    assert left_kg == pytest.approx([after_kg[0], drag_kg, *after_kg[1:]], abs=1e-9)
+
+
+def test_burns_of_weak_thrusters_are_weighed_in_the_order_of_their_times_too():
+    at = desk(duration_s=1000.0)
+    late = at.decide(0, command(800.0, 0, vector=(200.0, 0.0, 0.0)), 10.0)
+    at.failures.weaken(1, {0: 0.25})
+    weak = at.decide(0, command(500.0, 1, vector=(200.0, 0.0, 0.0)), 10.0)
+
+    left_kg = [at.execute(each).propellant_kg for each in (weak, late)]
+
+    exhaust_m_s = 220.0 * 9.80665
+    masses_kg = [100.0 * math.exp(-m_s / exhaust_m_s) for m_s in (50.0, 250.0)]
+    assert left_kg == pytest.approx([kg - 80.0 for kg in masses_kg], abs=1e-9)
 
 
 def test_a_torque_that_ends_during_or_after_a_burn_tells_what_is_left_then():

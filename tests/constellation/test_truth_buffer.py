@@ -172,6 +172,17 @@ def test_more_segments_than_the_bound_are_refused_and_counted(monkeypatch):
     assert small.refused == 1
 
 
+def test_a_segment_that_is_cut_short_gives_up_the_knots_behind(monkeypatch):
+    monkeypatch.setattr(truth_buffer, "KNOTS_HELD_MAX", 170)
+    buffer = TruthBuffer()
+    changes = [buffer.add(straight(3.5 * n, 101, revision=n, speed=7000.0 + n)) for n in range(12)]
+
+    assert all(changes)
+    assert [buffer.lookup(3.5 * n + 3.4)[3] for n in range(12)] == pytest.approx(
+        [7000.0 + n for n in range(12)]
+    )
+
+
 def test_an_hour_of_refills_keeps_memory_bounded():
     buffer = TruthBuffer()
     for window in range(360):

@@ -5,6 +5,7 @@ import pytest
 from constellation_fakes import parameters
 
 from madns_runtime.simulations.constellation.orbit.constants import GRAVITY_MODELS
+from madns_runtime.simulations.constellation.parameters import KNOTS_MAX
 from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
     Effect,
@@ -16,6 +17,7 @@ from madns_runtime.simulations.constellation.truth.maneuvers.rules import WAITIN
 from madns_runtime.simulations.constellation.truth.propagation import (
     PropagationParameters,
     StretchRequest,
+    TruthStretch,
     propagate,
     propagate_stretch,
 )
@@ -282,6 +284,31 @@ def test_an_agent_that_is_sent_the_change_flies_what_the_host_knows(at_s):
         assert rejoined.lookup(t_s) == pytest.approx(expected, abs=1e-6)
     assert (buffer.underruns, rejoined.underruns) == (0, 0)
     assert {s.revision for s in truth.store.segments(1, 0, 2)} == {2}
+
+
+def still(n, knot_s):
+    """A store of three windows of *n* intervals each, of a vehicle that does not move."""
+    store = TruthStore(1, knots_per_window=n, knot_s=knot_s)
+    states, invariants = np.full((1, 3 * n + 1, 6), 7e6), np.ones((1, 3 * n + 1, 3))
+    store.add(TruthStretch(first_knot=0, states=states, invariants=invariants))
+    return store
+
+
+@pytest.mark.parametrize("n", [36_000, (KNOTS_MAX - 2) // 2])
+def test_windows_of_more_knots_than_a_segment_has_travel_in_several(n):
+    store, buffer = still(n, 0.05), TruthBuffer()
+
+    segments = store.segments(0, 0, 2)
+
+    assert segments[-1].end_s == pytest.approx(store.end_s)
+    assert [s.t0_s for s in segments[1:]] == pytest.approx([s.end_s for s in segments[:-1]])
+    assert all(len(segment.states) <= KNOTS_MAX for segment in segments)
+    assert all(buffer.add(segment) for segment in segments)
+    for change_s in (0.6 * store.window_s, 0.7 * store.window_s):
+        # What a vehicle holds must leave room for the two windows and a half that a change brings.
+        store.revisions[0] += 1
+        assert all(buffer.add(segment) for segment in store.segments_from(0, change_s, 3))
+    assert all(buffer.lookup(part * store.end_s / 9) for part in range(10))
 
 
 def test_pieces_are_dropped_with_their_windows():

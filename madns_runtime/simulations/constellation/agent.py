@@ -22,6 +22,7 @@ from madns_runtime.plugin.api import (
     TimelineAction,
 )
 from madns_runtime.simulations.constellation.actions import SensorFault
+from madns_runtime.simulations.constellation.command_numbers import is_of_device
 from madns_runtime.simulations.constellation.messages import (
     GROUND,
     CommandResult,
@@ -41,10 +42,7 @@ from madns_runtime.simulations.constellation.orbit.elements import element_numbe
 from madns_runtime.simulations.constellation.parameters import ConstellationParameters
 from madns_runtime.simulations.constellation.record_rates import RecordedTicks
 from madns_runtime.simulations.constellation.streams import ATTITUDE, ELEMENTS, STATE, TRUTH_CHANGES
-from madns_runtime.simulations.constellation.vehicle.device_commands import (
-    DEVICE_NUMBER_FIRST,
-    DeviceCommands,
-)
+from madns_runtime.simulations.constellation.vehicle.device_commands import DeviceCommands
 from madns_runtime.simulations.constellation.vehicle.flight_tick import (
     Cockpit,
     fit_out,
@@ -264,7 +262,7 @@ class ConstellationAgent(AgentSimulation):
                 self._cockpit.refuse(refusal)
 
     def _take_result(self, result: CommandResult) -> None:
-        if self._devices is not None and result.number >= DEVICE_NUMBER_FIRST:
+        if self._devices is not None and is_of_device(result.number):
             self._devices.tell(result)
             if self._cockpit is not None:
                 self._cockpit.read_gauges(result)

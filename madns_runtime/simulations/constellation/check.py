@@ -36,6 +36,10 @@ from madns_runtime.simulations.constellation.truth.satellite_selection import (
     SatelliteSelection,
     choose,
 )
+from madns_runtime.simulations.constellation.vehicle.truth_buffer import (
+    KNOTS_HELD_MAX,
+    SEGMENTS_MAX,
+)
 from madns_runtime.simulations.constellation.vehicles import DEFAULT, rules_with_even_slots
 
 FIELD = "parameters.satellites.elements"
@@ -43,6 +47,10 @@ AGE_DAYS_MAX = 366.0
 """Between a set's epoch and the scenario's start. SGP4 is off by kilometres a day, after months by its whole orbit."""
 FAULTS_MAX = 20
 """Satellites that are named."""
+SEGMENTS_AHEAD = 8
+"""Segments that an agent must have room for beside those that come between two ticks."""
+WINDOWS_AHEAD = 3.5
+"""The same in windows: the one under way, up to two and a half that were sent ahead."""
 
 
 def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin.api.Simulation.check
@@ -78,7 +86,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
     except ConfigurationError as error:
         faults += str(error).splitlines()
     faults += _propagator_faults(parameters, folder)
-    faults += _segment_faults(parameters)
+    faults += _segment_faults(parameters) or _slow_tick_faults(parameters, tick_hz, duration_s)
     faults += _attitude_faults(parameters)
     faults += _missing_libraries(parameters)
     faults += board_faults(parameters, pairs)
@@ -230,6 +238,32 @@ def _segment_faults(parameters: ConstellationParameters) -> list[str]:
         ]
     if 2 * intervals + 1 > KNOTS_MAX:
         return [f"parameters.segments.buffer_s: expected at most {KNOTS_MAX} knots in a buffer"]
+    return []
+
+
+def _slow_tick_faults(
+    parameters: ConstellationParameters, tick_hz: float, duration_s: float
+) -> list[str]:
+    """Return why an agent has no room for what comes between two ticks: it forgets truth in ticks alone; not judged without their rate."""
+    if tick_hz <= 0.0:
+        return []
+    tick_s = min(1.0 / tick_hz, duration_s or math.inf)
+    knot_s, buffer_s = parameters.segments.knot_s, parameters.segments.buffer_s
+    between = f"between two ticks {tick_s:g} s apart (agents.tick_hz)"
+    windows = tick_s / (buffer_s / 2.0)
+    segments_max = SEGMENTS_MAX - SEGMENTS_AHEAD
+    if windows > segments_max:
+        return [
+            f"parameters.segments.buffer_s: expected at least {2.0 * tick_s / segments_max:.4g} s, got {buffer_s:g} s: "
+            f"an agent takes {windows:.0f} windows of half of it {between}, and holds {segments_max}; "
+            "give a longer segments.buffer_s"
+        ]
+    knots = (windows + WINDOWS_AHEAD) * (buffer_s / 2.0 / knot_s + 1.0)
+    if knots > KNOTS_HELD_MAX:
+        return [
+            f"parameters.segments.knot_s: expected at most {KNOTS_HELD_MAX} knots {between} and in the buffer, "
+            f"got {knots:.0f} every {knot_s:g} s; give a longer segments.knot_s or a shorter segments.buffer_s"
+        ]
     return []
 
 

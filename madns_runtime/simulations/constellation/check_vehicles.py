@@ -1,5 +1,5 @@
 """
-Faults in what a scenario says of vehicles and their sensors, and of the ground; and in code that it names.
+Faults in what a scenario says of vehicles and their sensors; and in code that it names.
 
 Whether code that it names is there is found out without running any of it, for `cosmos validate`: a file is
 parsed, not imported. What it does when it is imported shows on the agent.
@@ -21,6 +21,7 @@ from madns_runtime.plugin.code_places import CODE_BYTES_MAX
 from madns_runtime.plugin.registry import is_file
 from madns_runtime.simulations.constellation.actuation import actuation_faults
 from madns_runtime.simulations.constellation.alignment import alignment_fault
+from madns_runtime.simulations.constellation.check_radio import radio_faults
 from madns_runtime.simulations.constellation.equipment import (
     AnySensorDevice,
     ClockDevice,
@@ -70,7 +71,7 @@ def board_faults(
         faults += _sensor_faults(field, vehicle)
         faults += _actuation_faults(field, vehicle)
         faults += _stimulus_faults(field, vehicle, parameters.segments.buffer_s / 2.0)
-    faults += _ground_faults(parameters, names)
+    faults += radio_faults(parameters, names)
     return faults
 
 
@@ -271,26 +272,6 @@ def _device_faults(field: str, settings: AnySensorDevice) -> list[str]:
         for name in ("rate_hz", "latency_s", "dropout")
         if settings.model is not None and getattr(settings.model, name) != getattr(unused, name)
     ]
-    return faults
-
-
-def _ground_faults(
-    parameters: ConstellationParameters, names: Sequence[tuple[str, str]]
-) -> list[str]:
-    faults = []
-    known: set[str] = set()
-    for number, station in enumerate(parameters.stations):
-        if station.name in known:
-            field = f"parameters.stations[{number}].name"
-            faults.append(f"{field}: expected every name once, got {station.name!r} again")
-        known.add(station.name)
-    if parameters.uplinks and not parameters.stations:
-        faults.append("parameters.uplinks: need parameters.stations to leave from")
-    receivers = {name for pair in names for name in pair}
-    for number, uplink in enumerate(parameters.uplinks):
-        if receivers and uplink.to not in receivers:
-            field = f"parameters.uplinks[{number}].to"
-            faults.append(f"{field}: no agent and no satellite is called {uplink.to!r}")
     return faults
 
 

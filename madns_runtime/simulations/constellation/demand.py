@@ -193,7 +193,7 @@ def _maneuver(
     request = split(whole) or whole
     truth, took_s = _timed(propagate_vehicle, request, replace(propagation, element_sets=()))
     urgent = truth.states[:URGENT_KNOTS_MAX]
-    messages = [piece.to_segment(1) for piece in truth.pieces]
+    messages = [part for piece in truth.pieces for part in piece.to_segments(1)]
     if len(urgent) > 1:  # of long knots the piece up to the first one may be all that is urgent
         messages.append(Segment(revision=1, t0_s=knot_s, knot_s=knot_s, states=urgent))
     command = Command(

@@ -12,7 +12,7 @@ What vehicles say to each other and to the ground travels as the framework's mes
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, NamedTuple, Self, cast, get_args
 
@@ -40,6 +40,7 @@ __all__ = [
     "TankGauge",
     "TransmissionRefusal",
     "is_for_ground",
+    "knot_runs",
 ]
 
 GROUND = "ground"
@@ -219,6 +220,19 @@ class SatelliteLoss(Message):
     KIND = "satellite_loss"
 
     is_lost: bool
+
+
+def knot_runs(first: int, last: int) -> Iterator[tuple[int, int]]:
+    """
+    Yield first and last knot of the segments in which the knots from *first* to *last* travel.
+
+    One, unless they are more than a segment may have. Several share a knot, and have half as many as they might: an agent
+    forgets a segment as a whole.
+    """
+    intervals = last - first
+    step = max(1, intervals) if intervals < KNOTS_MAX else KNOTS_MAX // 2
+    for start in range(first, last, step):
+        yield start, min(start + step, last)
 
 
 def is_for_ground(to: str) -> bool:

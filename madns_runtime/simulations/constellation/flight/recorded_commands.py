@@ -9,13 +9,12 @@ from typing import Any, Final
 
 from madns_runtime.errors import BlamedError
 from madns_runtime.recording.reader import read_stream
+from madns_runtime.simulations.constellation.command_numbers import is_of_device
 from madns_runtime.simulations.constellation.flight.api import (
     AnsweredContext,
     Readings,
 )
 
-DEVICES_FROM: Final = 2**30
-"""Numbers from here on are commands of devices, which a rerun takes from the devices' records."""
 COMMANDS_MAX: Final = 16
 """Of one answer, as a vehicle takes them: of more that were given in one tick, several answers had come."""
 TICK_TOLERANCE: Final = 1e-6
@@ -38,7 +37,8 @@ class RecordedCommands:
         if not path.is_file():
             raise BlamedError(f"{path}: expected the commands of the recorded run, found none")
         self._rows = {
-            tick: [row for row in rows if row["number"] < DEVICES_FROM]
+            # Those of devices a rerun takes from the devices' records.
+            tick: [row for row in rows if not is_of_device(row["number"])]
             for tick, rows in _rows_by_tick(path).items()
         }
         path = folder / "estimates.jsonl"

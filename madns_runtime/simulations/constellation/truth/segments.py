@@ -10,12 +10,12 @@ known of it is one revision, and each change makes a new one.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.simulations.constellation.messages import Segment
+from madns_runtime.simulations.constellation.messages import Segment, knot_runs
 from madns_runtime.simulations.constellation.orbit.interpolation import (
     coefficients,
     evaluate,
@@ -257,27 +257,27 @@ class TruthStore:
             if piece.end_s <= from_s or piece.t0_s >= end_s:
                 continue
             if piece.t0_s > at_s:
-                result.append(self._run(vehicle, at_s, piece.t0_s))
-            result.append(piece.to_segment(revision, self._felt_ballistic(vehicle, piece.t0_s)))
+                result += self._runs(vehicle, at_s, piece.t0_s)
+            result += piece.to_segments(revision, self._felt_ballistic(vehicle, piece.t0_s))
             at_s = piece.end_s
         if at_s < end_s:
-            result.append(self._run(vehicle, at_s, end_s))
+            result += self._runs(vehicle, at_s, end_s)
         return result
 
-    def _run(self, vehicle: int, start_s: float, end_s: float) -> Segment:
-        """Return a segment of the grid between two of its knots."""
-        n = self.knots_per_window
-        first, last = round(start_s / self.knot_s), round(end_s / self.knot_s)
-        return Segment(
-            revision=self.revisions[vehicle],
-            t0_s=first * self.knot_s,
-            knot_s=self.knot_s,
-            states=_gather(self._states, vehicle, (first, last), n),
-            attitude=_gather(self._attitude, self._rigid[vehicle], (first, last), n)
-            if vehicle in self._rigid
-            else None,
-            ballistic_m2_kg=self._felt_ballistic(vehicle, first * self.knot_s),
-        )
+    def _runs(self, vehicle: int, start_s: float, end_s: float) -> Iterator[Segment]:
+        """Yield the grid between two of its knots, as far as a segment can hold it in one."""
+        n, row = self.knots_per_window, self._rigid.get(vehicle)
+        start, end = round(start_s / self.knot_s), round(end_s / self.knot_s)
+        ballistic_m2_kg = self._felt_ballistic(vehicle, start * self.knot_s)
+        for knots in knot_runs(start, end):
+            yield Segment(
+                revision=self.revisions[vehicle],
+                t0_s=knots[0] * self.knot_s,
+                knot_s=self.knot_s,
+                states=_gather(self._states, vehicle, knots, n),
+                attitude=None if row is None else _gather(self._attitude, row, knots, n),
+                ballistic_m2_kg=ballistic_m2_kg,
+            )
 
     def _felt_ballistic(self, vehicle: int, t_s: float) -> float | None:
         """Return what drag acts on from a time on, m^2/kg; None where nobody on board feels it."""

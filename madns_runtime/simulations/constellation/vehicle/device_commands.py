@@ -1,8 +1,8 @@
 """
 Commands of devices: values of their channels become commands of the vehicle, beside those of flight software.
 
-They go the same way: a desk that numbers and records them, the host's rules, results on record. Their numbers are
-from DEVICE_NUMBER_FIRST on, so that flight software's own keep the order in which it gave them.
+They go the same way: a desk that numbers and records them, the host's rules, results on record. Their numbers have a
+range of their own, so that flight software's keep the order in which it gave them.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.plugin.api import AgentContext
 from madns_runtime.simulations.constellation.actuation import VECTOR_SIZE, Actuation
+from madns_runtime.simulations.constellation.command_numbers import first_number
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import CommandResult
 from madns_runtime.simulations.constellation.thrust import Vector
@@ -22,9 +23,6 @@ from madns_runtime.simulations.constellation.vehicle.commands import (
     COMMANDS_PER_TICK_MAX,
     CommandDesk,
 )
-
-DEVICE_NUMBER_FIRST = 2**30
-"""Of a device's first command; those of flight software are below it."""
 
 
 class DeviceCommands:
@@ -43,7 +41,7 @@ class DeviceCommands:
     def __init__(self, context: AgentContext, vehicle: Vehicle, *, has_flight: bool) -> None:
         self._context = context
         rejoined_tick = max(0, math.ceil(context.now_s() * context.tick_hz))
-        first = DEVICE_NUMBER_FIRST + rejoined_tick * COMMANDS_PER_TICK_MAX
+        first = first_number(rejoined_tick * COMMANDS_PER_TICK_MAX, of_device=True)
         self._desk = CommandDesk(context, vehicle, first, opens_streams=not has_flight)
         self._lines = [
             _Line(actuation, context, place, is_rejoined=rejoined_tick > 0)

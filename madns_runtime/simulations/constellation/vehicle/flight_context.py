@@ -19,6 +19,7 @@ from madns_runtime.plugin.api import EVERYBODY, AgentContext
 from madns_runtime.protocol.codec import pack
 from madns_runtime.recording.records import Field
 from madns_runtime.simulations.constellation import streams
+from madns_runtime.simulations.constellation.command_numbers import first_number
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.flight_rates import flight_rate
 from madns_runtime.simulations.constellation.messages import (
@@ -95,7 +96,7 @@ class VehicleContext:
         rate = flight_rate(None if flight is None else flight.rate_hz, context.tick_hz)
         self.rate_hz = rate.hz
         steps = rejoined_tick * rate.steps_per_tick
-        self.first_number = steps * COMMANDS_PER_TICK_MAX
+        self.first_number = first_number(steps * COMMANDS_PER_TICK_MAX)
         """Of its first command: 0, or more in a vehicle that rejoined the run."""
         self._first_message = steps * MESSAGES_PER_TICK_MAX
         self.desk = desk = CommandDesk(context, vehicle, self.first_number)

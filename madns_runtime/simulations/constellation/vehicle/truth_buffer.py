@@ -48,6 +48,18 @@ class _Piece:
     thrust: Thrust | None
     ballistic_m2_kg: float | None
 
+    def cut_at(self, t_s: float) -> int:
+        """End it at *t_s*, and return how many knots behind that nobody will ask for are let go of."""
+        if t_s >= self.end_s:
+            return 0
+        self.end_s = t_s
+        kept = max(2, int((self.end_s - self.t0_s) / self.knot_s) + 3)
+        released = max(0, len(self.rows) - kept)
+        del self.rows[kept:]
+        if self.turns is not None:
+            del self.turns[kept:]
+        return released
+
     def velocity_at_end(self) -> Sequence[float]:
         """Return the velocity where it ends, m/s: that of its last knot, or between two where it was cut short."""
         part = (self.end_s - self.t0_s) / self.knot_s
@@ -98,11 +110,13 @@ class TruthBuffer:
         if end_s <= max(start_s, self._now_s):
             self.superseded += 1
             return False
+        # What it replaces makes room for it, and holds no more even if there is none.
+        self._begin(segment.revision, start_s)
+        self._low_s = self._high_s = math.inf  # the interval in use may be replaced
         held = len(self._pieces) >= SEGMENTS_MAX
         if held or self._knots + len(segment.states) > KNOTS_HELD_MAX:
             self.refused += 1
             return False
-        self._begin(segment.revision, start_s)
         piece = _Piece(
             segment.revision,
             start_s,
@@ -115,8 +129,6 @@ class TruthBuffer:
         )
         self._insert(piece)
         self.segments += 1
-        # The interval in use may have been replaced.
-        self._low_s = self._high_s = math.inf
         return True
 
     def lookup(self, t_s: float) -> tuple[float, ...] | None:
@@ -239,7 +251,7 @@ class TruthBuffer:
                 self.superseded += 1
                 continue
             if piece.revision < revision:
-                piece.end_s = min(piece.end_s, start_s)
+                self._knots -= piece.cut_at(start_s)
             pieces.append(piece)
         self._pieces = pieces
 

@@ -117,7 +117,7 @@ class Dialogue:
         values = {
             "tick_hz": setup.tick_hz,
             "duration_s": setup.duration_s,
-            "first_number": min(setup.first_number, U32),
+            "first_number": setup.first_number & U32,
             "seed": setup.seed & U32,
             "index": min(setup.index, U16),
             "agents": min(len(setup.agents), U16),

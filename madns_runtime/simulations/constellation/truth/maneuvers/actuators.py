@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from madns_runtime.simulations.constellation.command_numbers import COMMANDS_MAX
 from madns_runtime.simulations.constellation.equipment import (
     Magnetorquers,
     ReactionWheels,
@@ -36,8 +37,6 @@ DIPOLE_A_M2_MIN = 1e-12
 """Less turns nothing."""
 ARC_S_MIN = 0.01
 """A burn that is over sooner is an impulse; a torque or a dipole is not given for less, s."""
-COMMANDS_MAX = 2**31
-"""Numbers of commands are below it."""
 WHEELS_FAILED = "the wheels have failed"
 
 
@@ -71,9 +70,10 @@ class Tank:
     """
     Mass and propellant of one vehicle.
 
-    Burns are booked as they are accepted. The rocket equation makes the propellant of several depend on
-    the sum of their changes of velocity alone, so that what is left is right in whatever order they burn.
-    Until a burn is over the tank holds what is booked for it: see `left_kg`.
+    Burns are booked as they are accepted. By the rocket equation each multiplies the mass by a factor of its own, so
+    that what is left after all of them is right in whatever order they burn. Until a burn is over the tank holds
+    what is booked for it, see `left_kg`: that depends on the order of their times. One that is booked before others
+    of later times lifts more mass than they leave, and they less.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -85,9 +85,15 @@ class Tank:
 
     def book(self, burn: Burn, start_s: float, end_s: float, *, now_s: float) -> None:
         """Take off the propellant of a burn between two times, and forget those that are over now."""
+        waiting = [each for each in self._booked if each[1] > now_s]
+        self._booked, own_kg = [], burn.propellant_kg
+        for begins_s, ends_s, kg in waiting:
+            if begins_s > start_s:  # the vehicle is still as heavy, and lighter afterwards
+                own_kg += burn.burnt * kg
+                kg -= burn.burnt * kg  # noqa: PLW2901 - what is left of it
+            self._booked.append((begins_s, ends_s, kg))
+        self._booked.append((start_s, end_s, own_kg))
         self.burn(burn.propellant_kg)
-        self._booked = [each for each in self._booked if each[1] > now_s]
-        self._booked.append((start_s, end_s, burn.propellant_kg))
 
     def left_kg(self, t_s: float) -> float:
         """Return what the tank holds at *t_s*, not long ago or later: what burns booked until now have not burnt by then."""
@@ -110,7 +116,7 @@ def number_fault(command: Command) -> str:
     if not all(map(math.isfinite, numbers)):
         return f"expected finite numbers, got {numbers}"
     if not 0 <= command.number < COMMANDS_MAX:
-        return f"expected a number from 0 on, got {command.number}"
+        return f"expected a number from 0 on below {COMMANDS_MAX}, got {command.number}"
     return ""
 
 
@@ -298,6 +304,17 @@ def magnetise(
         if abs(commanded) > most
     )
     return Magnetisation(dipole_a_m2=scaled((x, y, z), factor), limits=limits)
+
+
+Given = Burn | WheelTurn | Magnetisation
+"""Effect of a command on an actuator."""
+
+
+def vector_of(given: Given) -> Vector:
+    """Return the change of velocity, torque or dipole that an actuator gives."""
+    if isinstance(given, Burn):
+        return given.vector
+    return given.torque_n_m if isinstance(given, WheelTurn) else given.dipole_a_m2
 
 
 class ActuatorFailures:

@@ -12,14 +12,18 @@ that interpolation never spans a jump.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from madns_runtime.simulations.constellation.messages import CommandFrame, Segment
+from madns_runtime.simulations.constellation.messages import (
+    CommandFrame,
+    Segment,
+    knot_runs,
+)
 from madns_runtime.simulations.constellation.thrust import Thrust, Vector
 
 EffectKind = Literal["impulse", "thrust", "torque", "ballistic", "dipole"]
@@ -201,17 +205,22 @@ class Piece:
         """Return the number of its last knot before *t_s*, which lies within it."""
         return max(0, math.ceil((t_s - self.t0_s) / self.knot_s - 1e-9) - 1)
 
-    def to_segment(self, revision: int, ballistic_m2_kg: float | None = None) -> Segment:
-        """Return the piece as it travels; a later segment cuts off what does not hold any more."""
-        return Segment(
-            revision=revision,
-            t0_s=self.t0_s,
-            knot_s=self.knot_s,
-            states=self.states,
-            attitude=self.attitude,
-            thrust=self.thrust,
-            ballistic_m2_kg=ballistic_m2_kg,
-        )
+    def to_segments(self, revision: int, ballistic_m2_kg: float | None = None) -> Iterator[Segment]:
+        """Yield the piece as it travels, nearly always one segment; a later one cuts off what does not hold any more."""
+        for first, last in knot_runs(0, len(self.states) - 1):
+            t0_s = self.t0_s + first * self.knot_s
+            if first and t0_s >= self.end_s:
+                return
+            rows = slice(first, last + 1)
+            yield Segment(
+                revision=revision,
+                t0_s=t0_s,
+                knot_s=self.knot_s,
+                states=self.states[rows],
+                attitude=None if self.attitude is None else self.attitude[rows],
+                thrust=self.thrust,
+                ballistic_m2_kg=ballistic_m2_kg,
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -30,6 +30,7 @@ from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
     ActuatorFailures,
     ActuatorRefusal,
     Burn,
+    Given,
     Magnetisation,
     Tank,
     WheelTurn,
@@ -39,6 +40,7 @@ from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
     number_fault,
     propellant_of,
     turn,
+    vector_of,
     vehicle_fault,
 )
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
@@ -65,8 +67,6 @@ ACTUATORS = {
 """Actuator of each effect; it does one thing at a time."""
 FIELD_T_MAX = 7e-5
 """The Earth's field is nowhere stronger, T."""
-Given = Burn | WheelTurn | Magnetisation
-"""Effect of a command on an actuator."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -320,8 +320,10 @@ class ManeuverDesk:
             if rules.settings.late == "refuse":
                 return replace(refused, reason=late)
             reasons = (late, *reasons)
-            # A whole tick: the first time that flight software could have named itself.
+            # A whole tick: the first time that flight software could have named itself, and none that it has passed.
             tick = math.ceil((ready_s - command.phase_s) * rules.tick_hz - 1e-9)
+            heard_tick = math.floor((refused.heard_s - command.phase_s) * rules.tick_hz + 1e-9)
+            tick = max(tick, heard_tick + 1, 1)
             start_s, status = snap(tick / rules.tick_hz, rules.knot_s), "postponed"
         end_s = snap(start_s + arc_s, rules.knot_s) if arc_s > 0.0 else start_s
         at_s = start_s + (end_s - start_s) / 2.0 if burn_s > 0.0 else start_s
@@ -334,7 +336,7 @@ class ManeuverDesk:
             at_s=at_s,
             start_s=start_s,
             end_s=end_s,
-            vector=_vector(command, given),
+            vector=command.vector if given is None else vector_of(given),
             frame="body" if is_turn else command.frame,
             burnt=given.burnt if isinstance(given, Burn) else 0.0,
         )
@@ -389,11 +391,3 @@ def _kind(command: Command, arc_s: float) -> EffectKind:
     if command.kind == "delta_v":
         return "thrust" if arc_s > 0.0 else "impulse"
     return command.kind
-
-
-def _vector(command: Command, given: Given | None) -> Vector:
-    if isinstance(given, Burn):
-        return given.vector
-    if isinstance(given, Magnetisation):
-        return given.dipole_a_m2
-    return given.torque_n_m if isinstance(given, WheelTurn) else command.vector

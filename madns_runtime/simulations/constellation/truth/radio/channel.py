@@ -10,6 +10,7 @@ Transmitters, chance, messages on their way and the account of them are the fram
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args
@@ -134,8 +135,10 @@ class Truth(Protocol):
 
 
 def index_of_names(agents: Sequence[str], satellites: Sequence[str]) -> dict[str, int]:
-    """Return who is meant by a name: an agent, or the one that flies the satellite of that name."""
-    index = {name: number for number, name in enumerate(satellites[: len(agents)])}
+    """Return who is meant by a name: an agent, or the only one that flies a satellite of that name."""
+    flown = satellites[: len(agents)]
+    bearers = Counter(flown)
+    index = {name: number for number, name in enumerate(flown) if bearers[name] == 1}
     index.update({name: number for number, name in enumerate(agents)})
     return index
 
