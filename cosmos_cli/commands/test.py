@@ -190,6 +190,7 @@ def _tell(
             "interrupted": result.count("interrupted"),
             "not_run": result.not_run,
             "deselected": chosen.deselected,
+            "left_out": chosen.left_out,
             "seconds": round(seconds, 3),
             "exit_code": int(code),
         }
@@ -226,14 +227,7 @@ def _chosen(
 ) -> ChosenCases:
     is_meant = parse_expression(expression) if expression else lambda names: True
     chosen = choose_cases(found, settings, seeds_of=seeds_of, is_meant=is_meant, warn=console.warn)
-    console.say(
-        collected_line(
-            len(chosen.cases),
-            scenarios=len(found.outlines),
-            others=len(found.others),
-            deselected=chosen.deselected,
-        )
-    )
+    console.say(collected_line(len(chosen.cases), found, deselected=chosen.deselected))
     if not chosen.cases:
         raise InputError(
             "no tests: "
