@@ -141,12 +141,16 @@ def _set_value(document: Document, key: str, path: Path, value: Any) -> Path:
     parent: Any = document.value
     written: Path = ()
     for step, following in zip(path, path[1:], strict=False):
-        parent, written = _descend(parent, (*written, step), key, following)
+        parent, written = _descend(document, parent, (*written, step), key, following)
     written = _assign(parent, (*written, path[-1]), key, value)
     for places in (document.value_places, document.key_places, document.texts):
         _forget(places, written)
-    document.value_places[written] = document.key_places[written] = SourcePlace(override=key)
+    _place_at(document, written, key)
     return written
+
+
+def _place_at(document: Document, path: Path, key: str) -> None:
+    document.value_places[path] = document.key_places[path] = SourcePlace(override=key)
 
 
 def _forget(places: dict[Path, Any], path: Path) -> None:
@@ -158,16 +162,21 @@ def _override_error(key: str, text: str) -> InputError:
     return InputError(faults=[Fault(text=text, override=key)])
 
 
-def _descend(parent: Any, path: Path, key: str, following: str | int) -> tuple[Any, Path]:
-    """Return the container at *path*, made if it is not there, and the path in its own terms."""
+def _descend(
+    document: Document, parent: Any, path: Path, key: str, following: str | int
+) -> tuple[Any, Path]:
+    """Return the container at *path*, made if it is not there, its place then that of *key*, and the path in its own terms."""
     fresh: Any = [] if isinstance(following, int) else {}
     path = _checked_step(parent, path, key)
     if isinstance(parent, list):
         index = int(path[-1])
         if index == len(parent):
             parent.append(fresh)
+            _place_at(document, path, key)
         child = parent[index]
     else:
+        if path[-1] not in parent:
+            _place_at(document, path, key)
         child = parent.get(path[-1])
         if child is None:
             child = parent[path[-1]] = fresh

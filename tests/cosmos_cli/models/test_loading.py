@@ -444,6 +444,21 @@ def test_faults_of_overrides_name_the_option_and_come_last(see):
     )
 
 
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("tme.duration_s=5", "tme: unknown key, did you mean time?"),
+        ("time.duration.s=5", "time.duration: unknown key, did you mean duration_s?"),
+        ("hardware.devises[0].x=1", "hardware.devises: unknown key, did you mean devices?"),
+        ("agents.names[0]=a", "agents.names: expected 3 names (agents.count), got 1"),
+    ],
+)
+def test_a_section_that_an_override_makes_is_blamed_on_the_option(see, override, told):
+    shown = see("name: a\nsimulation: counter\nagents: {count: 3}\n", override)
+
+    assert shown == f"--set {override.partition('=')[0]}: {told}"
+
+
 def test_long_lines_are_shown_around_the_caret(see):
     names = ", ".join(f"agent-{i}" for i in range(40))
 
