@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,6 +16,9 @@ from cosmos_cli.models.yaml_source import DEPTH_MAX, YamlSource
 
 KEY_CHARACTERS_SHOWN = 60
 OVERRIDES_MAX = 1000
+TEXT_CHARACTERS_QUOTED = 60
+_MARKS = tuple("[{\"'!&*|>")
+"""Beginnings of what is meant as more than a bare text."""
 _STEP = re.compile(r"([^.\[\]]+)|\[([0-9]{1,9})\]")
 _INDEX = re.compile(r"[0-9]{1,9}")
 KEY_FORM = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\])*")
@@ -125,10 +130,18 @@ def _parsed(override: str) -> tuple[str, Path, Any, str]:
     try:
         value, written, faults = read_value(YamlSource.of("", text))
     except InputError as error:
-        raise _override_error(key, error.faults[0].text) from None
+        raise _override_error(key, _no_value(key, text) or error.faults[0].text) from None
     if faults:
         raise _override_error(key, faults[0].text)
     return key, path, value, written
+
+
+def _no_value(key: str, text: str) -> str:
+    """Return what is wrong with a text that YAML does not take as one, such as `:`; empty of a list, or a text in quotes."""
+    if len(text) > TEXT_CHARACTERS_QUOTED or not text.isprintable() or text.strip()[:1] in _MARKS:
+        return ""
+    quoted = shlex.quote(f"{key}={json.dumps(text, ensure_ascii=False)}")
+    return f"expected a value, got {text!r}; write a text in quotes: --set {quoted}"
 
 
 def _set_value(document: Document, key: str, path: Path, value: Any) -> Path:

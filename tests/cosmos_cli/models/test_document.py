@@ -1,3 +1,5 @@
+import shlex
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -139,6 +141,15 @@ def test_override_that_would_be_dropped_is_refused():
 
     assert document.value == {"a": 2}
     assert faults == ["--set a: is given twice, and only one could count"]
+
+
+@pytest.mark.parametrize("text", [":", "@home", "a: b: c", "% done", "it's: x: y"])
+def test_a_text_that_is_no_yaml_is_told_with_how_it_is_written(text):
+    _, (fault,) = apply("d: x\n", f"d={text}")
+
+    assert fault.startswith(f"--set d: expected a value, got {text!r}; write a text in quotes: ")
+    (written,) = shlex.split(fault.partition("quotes: --set ")[2])
+    assert apply("d: x\n", written)[0].value == {"d": text}
 
 
 def test_all_bad_overrides_are_named():
