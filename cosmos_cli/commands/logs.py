@@ -214,7 +214,7 @@ def _names(sources: RecordingMachines) -> list[str]:
         HOST,
         *sources.machine_of_agent,
         *[source.machine for source in sources.remote],
-        *set(sources.machine_of_agent.values()),
+        *dict.fromkeys(sources.machine_of_agent.values()),
     ]
 
 
