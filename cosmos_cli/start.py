@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import sys
@@ -15,13 +16,32 @@ EXIT_CODE_MACHINES = 3
 
 def main() -> None:
     """Run the command line and end the process with its exit code."""
+    try:
+        _run()
+    finally:
+        _let_go_of_talk()
+
+
+def _let_go_of_talk() -> None:
+    """Give up what stderr does not take, as on a full disk: the interpreter would end with 120, whatever the verdict."""
+    try:
+        if sys.stderr is not None:
+            sys.stderr.flush()
+    except (OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 2)
+        os.close(null)
+
+
+def _run() -> None:
     gc.disable()  # imports make many objects and no garbage; the command itself is collected again
     # numpy's pool starts a thread per processor, which waits busily: a tenth of what this process of a short run computes.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         _import_app().main()
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
+        with contextlib.suppress(OSError):
+            sys.stderr.write("interrupted\n")
         sys.exit(130)
     except Exception as error:
         if is_out_of_memory(error):  # and not even any to tell by the usual ways

@@ -31,7 +31,12 @@ from cosmos_cli.evidence.devices import expected_devices, read_devices, recorded
 from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
 from cosmos_cli.evidence.manifest import build_manifest, pack_run
 from cosmos_cli.evidence.remarks import declared_streams, undeclared_remarks
-from cosmos_cli.evidence.run_directory import RESERVE_BYTES, RunDirectory, write_json
+from cosmos_cli.evidence.run_directory import (
+    RESERVE_BYTES,
+    RunDirectory,
+    was_interrupted,
+    write_json,
+)
 from cosmos_cli.evidence.run_documents import (
     MISSING,
     Problem,
@@ -194,7 +199,7 @@ def collect_run(
         run,
         result,
         _expected(run, before, result),
-        interrupted=before.get("status") == "interrupted",
+        interrupted=was_interrupted(before),
         problems=(*_problems_before(run, before), *problems),
         progress=progress,
         bytes_max=bytes_max,

@@ -72,7 +72,8 @@ def judge(
         expectations = planned_expectations(found.read_json(found.plan_json))
         if not expectations:
             raise InputError(
-                f"{found.name} had no checks; name a scenario that has: cosmos judge {found.shell_path} -s FILE"
+                f"{found.name}: its scenario has no `checks:` (those of its simulation stand in `cosmos report"
+                f" {found.shell_path}`); name a scenario that has: cosmos judge {found.shell_path} -s FILE"
             )
     else:
         file = load_scenario(scenario, warn=console.warn)

@@ -27,8 +27,11 @@ from cosmos_cli.launch.living_processes import by_name, targets_of
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from cosmos_cli.ui.plural import counted
+from madns_runtime.plain_values import first_few
 
 NAMED_MAX = 5
+SHOWN_MAX = 3
+"""Agents, and machines, that are named where none is like what was asked for."""
 LINES_DEFAULT = 10_000
 LINES_MAX = 1_000_000
 NO_TIME = " " * 12
@@ -211,7 +214,7 @@ def _names(sources: RecordingMachines) -> list[str]:
         HOST,
         *sources.machine_of_agent,
         *[source.machine for source in sources.remote],
-        *set(sources.machine_of_agent.values()),
+        *dict.fromkeys(sources.machine_of_agent.values()),
     ]
 
 
@@ -227,7 +230,10 @@ def _expect_known(
     if source is None or source in names or not sources.machine_of_agent:
         return
     hint = did_you_mean(source, names) if len(names) < 50 else ""
-    hint = hint if hint.endswith("?") else f": host, {', '.join(names[1:4])}, ..."
+    if not hint.endswith("?"):
+        agents = list(sources.machine_of_agent)
+        machines = [name for name in dict.fromkeys(names) if name not in (HOST, *agents)]
+        hint = f"; there are {HOST}, {first_few(agents, SHOWN_MAX)}, and as machines {first_few(machines, SHOWN_MAX)}"
     raise InputError(f"{run.name} has no agent, host or machine named {source}{hint}")
 
 

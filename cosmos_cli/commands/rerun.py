@@ -29,6 +29,7 @@ from cosmos_cli.rerun.flown_software import (
     installed_remarks,
     recorded_software,
     software_remarks,
+    told_as_gap,
     version_remarks,
 )
 from cosmos_cli.rerun.outcome import RerunOutcome, print_outcome
@@ -100,7 +101,8 @@ def rerun(
 def _fly(
     recorded: FlownRun, console: Console, root: Path, *, given: str, remarks: tuple[str, ...]
 ) -> RerunOutcome:
-    flown = make_rerun(recorded)
+    with told_as_gap(recorded.run, recorded.folder):
+        flown = make_rerun(recorded)
     remarks += flown.remarks
     for remark in remarks:
         console.say(remark)

@@ -37,6 +37,8 @@ from madns_runtime.bounded_files import real_path
 
 JOBS_MAX = 256
 SECONDS_MAX = 86_400.0 * 30
+OF_BUDGETS = ("time", "rtf_tolerance")
+"""Beside the section `deadline`, the setting that is no more than a limit."""
 
 
 PathsArgument = Annotated[
@@ -113,11 +115,9 @@ def test(
     or none is meant, 130 if interrupted.
     """
     console = Console(json=json, quiet=quiet, instead=_instead(junit))
-    if update_baselines and (seeds is not None or full_length or realtime_s_max is not None):
-        raise InputError(
-            "--update-baselines writes figures of the test as it stands: leave out --seeds,"
-            " --full-length and --realtime-max"
-        )
+    if update_baselines:
+        is_another = seeds is not None or full_length or realtime_s_max is not None
+        _refuse_other_tests(set_ or (), is_another=is_another)
     _refuse_section(set_ or ())
     prepare_junit(junit)
     settings = CaseSettings(
@@ -150,6 +150,26 @@ def test(
     finally:  # a disk that is full by now takes no file, and what failed is told all the same
         _tell(console, result, chosen, seconds, code=code)
     return int(code)
+
+
+def _refuse_other_tests(given: Sequence[str], *, is_another: bool) -> None:
+    """
+    Refuse to write baselines with figures of another test than the one that stands there.
+
+    Args:
+        given: Of --set; budgets of time change no figure of a run.
+        is_another: Whether an option makes it another.
+
+    Raises:
+        InputError: It is another.
+    """
+    steps = map(override_steps, given)
+    changing = [each for each in steps if each[0] != "deadline" and each != OF_BUDGETS]
+    if is_another or changing:
+        raise InputError(
+            "--update-baselines writes figures of the test as it stands: leave out --seeds, --full-length, --realtime-max"
+            f" and --set (but that of deadline.* and {'.'.join(OF_BUDGETS)}); what always holds belongs in its test.set"
+        )
 
 
 def _refuse_section(given: Sequence[str]) -> None:
@@ -190,6 +210,7 @@ def _tell(
             "interrupted": result.count("interrupted"),
             "not_run": result.not_run,
             "deselected": chosen.deselected,
+            "left_out": chosen.left_out,
             "seconds": round(seconds, 3),
             "exit_code": int(code),
         }
@@ -226,14 +247,7 @@ def _chosen(
 ) -> ChosenCases:
     is_meant = parse_expression(expression) if expression else lambda names: True
     chosen = choose_cases(found, settings, seeds_of=seeds_of, is_meant=is_meant, warn=console.warn)
-    console.say(
-        collected_line(
-            len(chosen.cases),
-            scenarios=len(found.outlines),
-            others=len(found.others),
-            deselected=chosen.deselected,
-        )
-    )
+    console.say(collected_line(len(chosen.cases), found, deselected=chosen.deselected))
     if not chosen.cases:
         raise InputError(
             "no tests: "

@@ -53,6 +53,8 @@ BUNDLE_SUFFIX = ".tar.zst"
 HOST_TABLE = "truth.parquet"
 RUNS_VARIABLE = "COSMOS_RUNS"
 RUNS_FOLDER = "runs"
+INTERRUPTED = "interrupted"
+"""Key of run.json that is true from the operator's word to end the run until the run is judged."""
 RUN_NAME = re.compile(rf"^([0-9]{{4,{len(str(NUMBER_MAX))}}})-(.+)$")
 VERSIONED_PACKAGES = ("cosmos-madns", "numpy", "scipy", "sgp4", "msgpack", "orjson", "pyarrow")
 UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
@@ -323,6 +325,19 @@ def begin_run(
     write_json(run.plan_json, {**plan, "config": to_mapping(config)})
     document = starting_document(run.name, config, utc_now())
     write_json(run.run_json, document | ({} if flown is None else {"flown": flown}))
+
+
+def note_interruption(run: RunDirectory) -> None:
+    """Note in run.json that the operator has ended the run: its host may have no result, and collecting may be cut off."""
+    document = run.read_json(run.run_json)
+    if document is not None:
+        with contextlib.suppress(OSError):
+            write_json(run.run_json, {**document, INTERRUPTED: True})
+
+
+def was_interrupted(document: Mapping[str, Any]) -> bool:
+    """Tell whether run.json says that the operator ended the run."""
+    return document.get("status") == "interrupted" or document.get(INTERRUPTED) is True
 
 
 def starting_document(name: str, config: RunConfig, started_utc: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from cosmos_cli.evidence.run_directory import (
     begin_run,
     create_run,
     discard_run,
+    note_interruption,
 )
 from cosmos_cli.evidence.run_documents import EXPECTATIONS, Problem
 from cosmos_cli.fleet.connection import ConnectOptions
@@ -269,6 +270,8 @@ def _execute(
             outcome = Operator(request, view, signals, prepared.remote).run()
             if outcome.is_detached:
                 return Detached(run)
+            if outcome.interruption != "no":
+                note_interruption(run)  # also where collecting is cut off
             signals.raise_from_now()
             return _finish(prepared, outcome, options, view=view)
         except KeyboardInterrupt:

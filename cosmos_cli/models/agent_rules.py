@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from cosmos_cli.errors import Fault
 from cosmos_cli.models.agent_labels import AgentLabels
-from cosmos_cli.models.document import Document, Path, did_you_mean, may_guess
+from cosmos_cli.models.document import Document, Path, did_you_mean, dotted, may_guess
 from cosmos_cli.models.extending import merge_mapping
 from madns_runtime.plugin.api import Simulation
 
@@ -52,6 +52,13 @@ def select_agents(
         taken |= dict.fromkeys(own, index)
         chosen.append(own)
     return chosen, faults
+
+
+def faults_in_rules(document: Document, faults: Sequence[Fault]) -> list[Fault]:
+    """Return the faults of values and keys that rules themselves write: others are of the parameters of all."""
+    places = (*document.value_places, *document.key_places)
+    written = {dotted(path) for path in places if path[:1] == (RULES,)}
+    return [fault for fault in faults if fault.path in written]
 
 
 def refused_parameters(

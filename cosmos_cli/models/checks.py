@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
+from cosmos_cli.models.agent_labels import AgentLabels
 from cosmos_cli.models.check_rules import OF_NUMBERS, OF_TIMES, CheckRule
 from cosmos_cli.models.device_uses import named_agents
 from cosmos_cli.models.document import did_you_mean
@@ -49,19 +49,23 @@ class ResolvedChecks:
     """Paths within the list of checks."""
 
 
-def resolve_checks(rules: Sequence[CheckRule], around: Surroundings) -> ResolvedChecks:
+def resolve_checks(
+    rules: Sequence[CheckRule], around: Surroundings, places: Sequence[int] | None = None
+) -> ResolvedChecks:
     """
     Return what is judged by the checks of a scenario.
 
     Args:
         rules: As they are written.
         around: The agents and streams that they are about.
+        places: Of each in the list, if others have faults of their own and are not among them; None for all.
     """
     faults: list[RuleFault] = []
     found: list[Expectation] = []
     earlier: dict[str, CheckRule] = {}
-    for index, rule in enumerate(rules):
-        own = [*rule.own_faults(), *_faults_among(rule, earlier), *_Placing(rule, around).faults()]
+    for index, rule in zip(range(len(rules)) if places is None else places, rules, strict=True):
+        among = _faults_among(rule, earlier, is_whole=places is None)
+        own = [*rule.own_faults(), *among, *_Placing(rule, around).faults()]
         faults += words_at((index,), iter(own))
         earlier.setdefault(rule.name, rule)
         if not own:
@@ -72,51 +76,43 @@ def resolve_checks(rules: Sequence[CheckRule], around: Surroundings) -> Resolved
 
 
 def scenario_checks(
-    scenario: Scenario, answers: PluginAnswers, streams: KnownStreams, broken: frozenset[str]
+    scenario: Scenario,
+    answers: PluginAnswers,
+    streams: KnownStreams,
+    places: Sequence[int] | None,
 ) -> ResolvedChecks:
     """
-    Return what the checks of a scenario expect; nothing while it is open what they are about.
+    Return what the checks of a scenario expect; nothing while it is open which agents there are.
 
     Args:
         scenario: The scenario.
-        answers: Of its simulation.
+        answers: Of its simulation; while its parameters have faults, any stream may be one of it.
         streams: That it, its devices and the framework record.
-        broken: Keys with faults of their own.
+        places: As `resolve_checks` takes them.
     """
-    agents = scenario.agents.resolved_names()
-    is_open = answers.labels is None or answers.parameters is None
-    if is_open or broken.intersection(("checks", "agents", "time")):
+    if answers.labels is None:
         return ResolvedChecks((), ())
+    agents = scenario.agents.resolved_names()
     around = Surroundings(
         agents=agents,
-        labels=answers.labels or NO_LABELS,
+        labels=answers.labels,
         streams=streams,
         duration_s=scenario.time.duration_s,
     )
-    return resolve_checks(scenario.checks, around)
+    return resolve_checks(scenario.checks, around, places)
 
 
-def unjudged_remark(expectations: Sequence[Expectation], *, is_lockstep: bool) -> str:
-    """Return in words that runs of a time mode can judge none of these, and end without a result; empty where some are."""
-    unjudged: set[str] = set()
-    for each in expectations:
-        if each.after in unjudged or not each.is_judged_in(is_lockstep=is_lockstep):
-            unjudged.add(each.name)
-    if not unjudged or len(unjudged) < len(expectations):
-        return ""
-    return (
-        f"none can be judged, such as {expectations[0].name}: runs in lockstep do not record its stream, and this one"
-        " would end as DATA INCOMPLETE; add a check of another stream, or fly in real time"
-    )
-
-
-def _faults_among(rule: CheckRule, earlier: dict[str, CheckRule]) -> Iterator[RuleFault]:
+def _faults_among(
+    rule: CheckRule, earlier: dict[str, CheckRule], *, is_whole: bool
+) -> Iterator[RuleFault]:
     if rule.name in earlier:
         yield ("name",), f"expected unique names, got {rule.name!r} again"
     if rule.after is None:
         return
     other = earlier.get(rule.after)
     timed = [each.name for each in earlier.values() if _has_time(each)]
+    if other is None and not is_whole:
+        return  # it may be one with faults of its own
     if other is None:
         text = f"no check above is named {rule.after!r}{did_you_mean(rule.after, timed)}"
         yield ("after",), text
@@ -158,6 +154,8 @@ class _Placing:
         yield from self._time_faults()
         if fault := streams.stream_fault(self._stream):
             yield ("stream",), fault
+            return
+        if streams.is_unasked(self._stream, rule.while_.stream if rule.while_ else self._stream):
             return
         yield from self._apart_faults() if self._is_apart else self._agent_faults()
         if rule.stop_when_broken and (fault := streams.apart_fault(self._stream, self._field)):

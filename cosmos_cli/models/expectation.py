@@ -136,3 +136,17 @@ def scaled(bounds: ValueBounds, factor: float) -> ValueBounds:
         None if each is None else converted(each, factor) for each in (bounds.low, bounds.high)
     )
     return replace(bounds, low=low, high=high)
+
+
+def unjudged_remark(expectations: Sequence[Expectation], *, is_lockstep: bool) -> str:
+    """Return in words that runs of a time mode can judge none of these, and end without a result; empty where some are."""
+    unjudged: set[str] = set()
+    for each in expectations:
+        if each.after in unjudged or not each.is_judged_in(is_lockstep=is_lockstep):
+            unjudged.add(each.name)
+    if not unjudged or len(unjudged) < len(expectations):
+        return ""
+    return (
+        f"none can be judged, such as {expectations[0].name}: runs in lockstep do not record its stream, and this one"
+        " would end as DATA INCOMPLETE; add a check of another stream, or fly in real time"
+    )

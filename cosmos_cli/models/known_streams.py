@@ -124,12 +124,18 @@ class KnownStreams:
     Args:
         declared: By the simulation; None if it declares none, and then any other name may be one.
         devices: That agents use.
+        is_partial: Whether the simulation could not be asked, as while its parameters have faults.
     """
 
     def __init__(
-        self, declared: Sequence[DeclaredStream] | None, devices: Sequence[KnownDevice] = ()
+        self,
+        declared: Sequence[DeclaredStream] | None,
+        devices: Sequence[KnownDevice] = (),
+        *,
+        is_partial: bool = False,
     ) -> None:
         self._is_declared = declared is not None
+        self._is_partial = is_partial
         self._channels_open: dict[str, list[KnownDevice]] = {}
         for device in devices:
             if device.streams is None:
@@ -164,6 +170,10 @@ class KnownStreams:
             told = ", ".join(known) or f"{name}.CHANNEL"
             return f"{name} is a device: expected a channel of it, such as {told}"
         return f"no stream {name!r} is recorded{did_you_mean(name, list(self._streams))}"
+
+    def is_unasked(self, *names: str) -> bool:
+        """Tell whether one of these streams may be the simulation's, which could not be asked about it."""
+        return self._is_partial and not all(self.of(name) for name in names)
 
     def has_numbers(self, device: str) -> bool:
         """Tell whether an input of a device is of numbers, and no frame; so it may be where its channels are not known."""

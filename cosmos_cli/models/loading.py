@@ -12,12 +12,13 @@ from pydantic import ValidationError
 
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
-from cosmos_cli.models.checks import scenario_checks, unjudged_remark
+from cosmos_cli.models.agent_rules import RULES
+from cosmos_cli.models.checks import ResolvedChecks, scenario_checks
 from cosmos_cli.models.declared_streams import AgentStreams, every_stream
 from cosmos_cli.models.document import Document, dotted, read_document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.executor_answer import EXECUTOR_KIND, ask_executor
-from cosmos_cli.models.expectation import Expectation, conditions_of_checks
+from cosmos_cli.models.expectation import Expectation, conditions_of_checks, unjudged_remark
 from cosmos_cli.models.extending import ScenarioSource, read_scenario_source
 from cosmos_cli.models.fault_place import fault_found_at
 from cosmos_cli.models.hardware import hardware_faults
@@ -25,7 +26,7 @@ from cosmos_cli.models.known_streams import KnownDevice, KnownStreams
 from cosmos_cli.models.overrides import apply_overrides
 from cosmos_cli.models.own_requirements import own_requirement_faults
 from cosmos_cli.models.place_uses import cure_of, shared_places
-from cosmos_cli.models.plugin_answers import ask_plugin
+from cosmos_cli.models.plugin_answers import PluginAnswers, ask_plugin
 from cosmos_cli.models.plugin_demand import ask_plugin_demand
 from cosmos_cli.models.scenario import OF_AUTHORS, Scenario, cross_faults
 from cosmos_cli.models.test_settings import settings_without_variables
@@ -45,6 +46,11 @@ from madns_runtime.config import RunConfig, to_mapping
 from madns_runtime.plugin.api import DeclaredStream, Demand, PlaceUse
 
 RULE_LISTS = ("checks[", "timeline[")
+_ASKED = frozenset({"agents", "time"})
+"""Keys that a simulation is asked with; of the others its answers do not speak."""
+_OF_DEVICES = _ASKED | {"hardware", "timeouts"}
+_OF_ACTIONS = _OF_DEVICES | {"on_agent_loss"}
+_OF_PARAMETERS = frozenset({"parameters", RULES})
 _PLACEHOLDERS = {"name": "x", "simulation": "x", "agents": {"count": 1}}
 """Stand in for sections with faults, while the others are checked against each other."""
 
@@ -220,43 +226,33 @@ def _check(
     document, base_directory = source.document, source.root
     scenario, broken, scenario_faults = _scenario(document)
     faults = faults + scenario_faults
-    agents, duration_s = (None, 0.0) if broken else (scenario.agents, scenario.time.duration_s)
-    requirements = () if broken else scenario.requirements
+    agents = None if _ASKED & broken.keys() else scenario.agents
     faults += [
         document.fault(where, text)
-        for where, text in own_requirement_faults(requirements, base_directory)
+        for where, text in own_requirement_faults(scenario.requirements, base_directory)
     ]
-    answers = ask_plugin(document, agents, base_directory, duration_s=duration_s)
+    asked = _without(document, RULES) if _OF_PARAMETERS & broken.keys() else document
+    answers = ask_plugin(asked, agents, base_directory, duration_s=scenario.time.duration_s)
     faults += answers.faults
     devices: tuple[KnownDevice, ...] = ()
-    if not broken:
-        device_faults, devices = hardware_faults(
-            document, scenario, base_directory, labels=answers.labels, uses=answers.device_uses
-        )
+    if not _OF_DEVICES & broken.keys():
+        device_faults, devices = _hardware(document, scenario, base_directory, answers)
         faults += device_faults
-        if scenario.time.is_lockstep:  # all on this computer
-            names = scenario.agents.resolved_names()
-            faults += [
-                fault_found_at(
-                    document,
-                    f"{field}: {text}; {cure_of(field, answers.placeholders, has_machines=False)}",
-                )
-                for field, text in shared_places(answers.place_uses, names)
-            ]
     faults += [
         document.fault(where, text)
-        for where, text in cross_faults(scenario, skip=broken, labels=answers.labels)
+        for where, text in cross_faults(scenario, skip=frozenset(broken), labels=answers.labels)
     ]
-    wrong, odd = ("", "") if broken else ask_executor(scenario)
+    wrong, odd = ask_executor(scenario)
     faults += [document.fault(EXECUTOR_KIND, wrong)] if wrong else []
     remarks = (*answers.remarks, *([document.fault(EXECUTOR_KIND, odd)] if odd else []))
     declared = answers.streams and every_stream(answers.streams, answers.agent_streams)
-    streams = KnownStreams(declared, devices)
-    timeline = NO_TIMELINE
-    if not broken - {"timeline"}:
+    streams = KnownStreams(declared, devices, is_partial=answers.parameters is None)
+    timeline, checks = NO_TIMELINE, ResolvedChecks((), ())
+    if not _OF_ACTIONS & broken.keys():
         timeline = resolve_timeline(document, scenario, answers.actions, answers.labels, streams)
     faults += timeline.faults
-    checks = scenario_checks(scenario, answers, streams, broken)
+    if not _OF_DEVICES & broken.keys():
+        checks = scenario_checks(scenario, answers, streams, broken.get("checks"))
     faults += [document.fault(("checks", *where), text) for where, text in checks.faults]
     lockstep = not broken and scenario.time.is_lockstep
     if text := unjudged_remark(checks.expectations, is_lockstep=lockstep):
@@ -283,6 +279,25 @@ def _check(
         remarks=remarks,
         expectations=checks.expectations,
     )
+
+
+def _hardware(
+    document: Document, scenario: Scenario, base_directory: Path, answers: PluginAnswers
+) -> tuple[list[Fault], tuple[KnownDevice, ...]]:
+    """Return what is wrong with devices, or with places that agents in lockstep share, and the devices."""
+    faults, devices = hardware_faults(
+        document, scenario, base_directory, labels=answers.labels, uses=answers.device_uses
+    )
+    if scenario.time.is_lockstep:  # all on this computer
+        names = scenario.agents.resolved_names()
+        faults += [
+            fault_found_at(
+                document,
+                f"{field}: {text}; {cure_of(field, answers.placeholders, has_machines=False)}",
+            )
+            for field, text in shared_places(answers.place_uses, names)
+        ]
+    return faults, devices
 
 
 def _told_once(faults: Sequence[Fault], document: Document) -> list[Fault]:
@@ -324,17 +339,40 @@ def _place(fault: Fault) -> tuple[object, ...]:
     return fault.override, fault.file, fault.line, fault.column
 
 
-def _scenario(document: Document) -> tuple[Scenario, frozenset[str], list[Fault]]:
-    """Return the scenario, which keys of it have faults of their own and stand as placeholders, and the faults."""
+def _without(document: Document, key: str) -> Document:
+    """Return a document of the same places without a section that has faults of its own."""
+    return replace(document, value={k: v for k, v in document.value.items() if k != key})
+
+
+def _scenario(
+    document: Document,
+) -> tuple[Scenario, Mapping[str, Sequence[int]], list[Fault]]:
+    """
+    Return the scenario, its keys with faults of their own, and the faults.
+
+    Such a key stands as a placeholder, or is left out; of checks those that are right remain, whose places come with
+    the key.
+    """
     try:
-        return _validate_scenario(document.value), frozenset(), []
+        return _validate_scenario(document.value), {}, []
     except ValidationError as error:
         errors = error.errors(include_url=False)
         faults = faults_of(document, errors, Scenario)
-        broken = frozenset(str(item["loc"][0]) for item in errors)
+        broken: dict[str, Sequence[int]] = {str(item["loc"][0]): () for item in errors}
         rest = {key: value for key, value in document.value.items() if key not in broken}
         spared = {key: value for key, value in _PLACEHOLDERS.items() if key in broken}
+        if "checks" in broken:
+            broken["checks"] = _right_checks(document, [item["loc"] for item in errors])
+            spared["checks"] = [document.value["checks"][place] for place in broken["checks"]]
         return _validate_scenario(rest | spared), broken, faults
+
+
+def _right_checks(document: Document, locations: Sequence[tuple[str | int, ...]]) -> list[int]:
+    """Return places of checks without faults of their own; none if the list itself has one."""
+    faulty = [where[1:2] for where in locations if where[0] == "checks"]
+    if not faulty or () in faulty:
+        return []
+    return [place for place in range(len(document.value["checks"])) if (place,) not in faulty]
 
 
 def _validate_scenario(value: Any) -> Scenario:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,6 +16,9 @@ from cosmos_cli.models.yaml_source import DEPTH_MAX, YamlSource
 
 KEY_CHARACTERS_SHOWN = 60
 OVERRIDES_MAX = 1000
+TEXT_CHARACTERS_QUOTED = 60
+_MARKS = tuple("[{\"'!&*|>")
+"""Beginnings of what is meant as more than a bare text."""
 _STEP = re.compile(r"([^.\[\]]+)|\[([0-9]{1,9})\]")
 _INDEX = re.compile(r"[0-9]{1,9}")
 KEY_FORM = re.compile(r"[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\])*")
@@ -125,10 +130,18 @@ def _parsed(override: str) -> tuple[str, Path, Any, str]:
     try:
         value, written, faults = read_value(YamlSource.of("", text))
     except InputError as error:
-        raise _override_error(key, error.faults[0].text) from None
+        raise _override_error(key, _no_value(key, text) or error.faults[0].text) from None
     if faults:
         raise _override_error(key, faults[0].text)
     return key, path, value, written
+
+
+def _no_value(key: str, text: str) -> str:
+    """Return what is wrong with a text that YAML does not take as one, such as `:`; empty of a list, or a text in quotes."""
+    if len(text) > TEXT_CHARACTERS_QUOTED or not text.isprintable() or text.strip()[:1] in _MARKS:
+        return ""
+    quoted = shlex.quote(f"{key}={json.dumps(text, ensure_ascii=False)}")
+    return f"expected a value, got {text!r}; write a text in quotes: --set {quoted}"
 
 
 def _set_value(document: Document, key: str, path: Path, value: Any) -> Path:
@@ -141,12 +154,16 @@ def _set_value(document: Document, key: str, path: Path, value: Any) -> Path:
     parent: Any = document.value
     written: Path = ()
     for step, following in zip(path, path[1:], strict=False):
-        parent, written = _descend(parent, (*written, step), key, following)
+        parent, written = _descend(document, parent, (*written, step), key, following)
     written = _assign(parent, (*written, path[-1]), key, value)
     for places in (document.value_places, document.key_places, document.texts):
         _forget(places, written)
-    document.value_places[written] = document.key_places[written] = SourcePlace(override=key)
+    _place_at(document, written, key)
     return written
+
+
+def _place_at(document: Document, path: Path, key: str) -> None:
+    document.value_places[path] = document.key_places[path] = SourcePlace(override=key)
 
 
 def _forget(places: dict[Path, Any], path: Path) -> None:
@@ -158,16 +175,21 @@ def _override_error(key: str, text: str) -> InputError:
     return InputError(faults=[Fault(text=text, override=key)])
 
 
-def _descend(parent: Any, path: Path, key: str, following: str | int) -> tuple[Any, Path]:
-    """Return the container at *path*, made if it is not there, and the path in its own terms."""
+def _descend(
+    document: Document, parent: Any, path: Path, key: str, following: str | int
+) -> tuple[Any, Path]:
+    """Return the container at *path*, made if it is not there, its place then that of *key*, and the path in its own terms."""
     fresh: Any = [] if isinstance(following, int) else {}
     path = _checked_step(parent, path, key)
     if isinstance(parent, list):
         index = int(path[-1])
         if index == len(parent):
             parent.append(fresh)
+            _place_at(document, path, key)
         child = parent[index]
     else:
+        if path[-1] not in parent:
+            _place_at(document, path, key)
         child = parent.get(path[-1])
         if child is None:
             child = parent[path[-1]] = fresh

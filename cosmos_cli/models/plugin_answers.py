@@ -16,7 +16,13 @@ from pydantic import ValidationError
 
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
-from cosmos_cli.models.agent_rules import RULES, refused_parameters, rule_document, select_agents
+from cosmos_cli.models.agent_rules import (
+    RULES,
+    faults_in_rules,
+    refused_parameters,
+    rule_document,
+    select_agents,
+)
 from cosmos_cli.models.declared_streams import AgentStreams, every_stream
 from cosmos_cli.models.document import Document
 from cosmos_cli.models.fault_place import fault_found_at
@@ -153,7 +159,9 @@ class _Asking:
             placeholders=simulation.placeholders,
             actions=actions,
         )
-        if parameters is not None and self._agents is not None:
+        if self._agents is not None and parameters is None:
+            self._rules(simulation, self._agents, found, duration_s)
+        elif self._agents is not None:
             own = self._of(simulation, parameters, self._agents, duration_s)
             found = replace(found, labels=self._labels(simulation, parameters, self._agents))
             rules = self._rules(simulation, self._agents, found, duration_s)
@@ -195,7 +203,7 @@ class _Asking:
     def _rules(
         self, simulation: Simulation, agents: Agents, of_all: PluginAnswers, duration_s: float
     ) -> list[ParameterAnswers]:
-        """Ask the same of the parameters that rules give some agents."""
+        """Ask the same of the parameters that rules give some agents; of faulty ones for all, what is written in rules."""
         given = self._document.value.get(RULES) or ()
         names = agents.resolved_names()
         chosen, faults = select_agents(self._document, names, of_all.labels)
@@ -205,7 +213,9 @@ class _Asking:
             document = rule_document(self._document, index)
             asking = _Asking(document, agents, self._base_directory, self._tell)
             parameters = asking._parameters(simulation, ())
-            if parameters is not None:
+            if of_all.parameters is None:  # nor is it known what more the rule's would have to fit
+                asking._faults = faults_in_rules(self._document, asking._faults)
+            elif parameters is not None:
                 one = asking._of(simulation, parameters, agents, duration_s)
                 found.append(replace(one, agents=chosen[index]))
                 self._faults += refused_parameters(

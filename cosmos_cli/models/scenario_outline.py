@@ -22,6 +22,7 @@ from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test
 from cosmos_cli.models.test_settings import SECTION, giving_way, test_overrides
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import substitute_variables
+from madns_runtime.similar_words import most_similar
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,9 +133,20 @@ def read_outline(path: Path) -> ScenarioOutline:
 
 
 def is_scenario(document: Document) -> bool:
-    """Tell whether a file of a folder means to be a scenario that can run, and no inventory, baseline or base of others."""
+    """
+    Tell whether a file of a folder means to be a scenario that can run, and no inventory, baseline or base of others.
+
+    One of its two words may be misspelt or forgotten: its agents tell it from other programs' files. A simulation with
+    no name is a base of others, unless a key is much like `name`.
+    """
     value = document.value
-    return "extends" in value or ("name" in value and "simulation" in value)
+    if "extends" in value or ("name" in value and "simulation" in value):
+        return True
+    agents = value.get("agents")
+    if not isinstance(agents, dict) or agents.keys().isdisjoint(_OF_AGENTS):
+        return False
+    has_similar = any(most_similar(key, ("name",)) for key in value)
+    return "name" in value or ("simulation" in value and has_similar)
 
 
 def check_test(scenario: ScenarioFile, warn: Callable[[str], None]) -> None:
@@ -178,4 +190,5 @@ def with_seed(overrides: Sequence[str], seed: int | None) -> list[str]:
     return [*(item for item in overrides if override_steps(item) != ("seed",)), f"seed={seed}"]
 
 
+_OF_AGENTS = ("count", "names", "tick_hz")
 _ADAPTER: TypeAdapter[ScenarioTest] = TypeAdapter(ScenarioTest)

@@ -37,6 +37,8 @@ class AwaitedCondition:
         if fault := streams.stream_fault(rule.stream):
             yield ("stream",), fault
             return
+        if streams.is_unasked(rule.stream):
+            return
         if fault := streams.apart_fault(rule.stream, rule.field):
             yield ("stream",), fault
             return

@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
-from cosmos_cli.evidence.statistics import TickStatistics, tick_statistics
+from cosmos_cli.evidence.datagrams import whole_count
+from cosmos_cli.evidence.statistics import TickStatistics, tick_statistics, with_told_misses
+from cosmos_cli.evidence.tick_causes import ABSENT, recorded_causes
 from cosmos_cli.ui.plural import counted
 from madns_runtime.analysis.lines import field_lines
 from madns_runtime.analysis.sampling import BinCounts, TimeEnvelope, envelope_series
@@ -23,6 +25,7 @@ from madns_runtime.analysis.values import (
     TableBlock,
     headings,
 )
+from madns_runtime.plain_values import mapping_at
 
 LATENESS_US_MIN = 1.0
 HISTOGRAM_BINS = 90
@@ -34,7 +37,7 @@ def tick_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
     """Return lateness over time, the histograms of lateness and margin, missed ticks, and the table."""
     if not table.rows:
         return [ReportRemark(text="No tick was recorded.")]
-    ticks = tick_statistics(table)
+    ticks = with_told_misses(tick_statistics(table), _told_misses(run))
     return [
         _lateness_over_time(table, run, 1000 * ticks.lateness_ms.get("max", 1.0)),
         _lateness_histogram(table, run),
@@ -42,6 +45,17 @@ def tick_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
         _missed(ticks),
         _tick_table(ticks),
     ]
+
+
+def _told_misses(run: RecordedRun) -> dict[str, int]:
+    """Return missed ticks by agent as run.json counts them: those that were told, and those that nobody told of."""
+    told = recorded_causes(run.tables.get("late_ticks"))
+    absent = mapping_at(run.document, "timing", "causes_by_agent")
+    return {
+        name: (told[name].missed if name in told else 0)
+        + whole_count(mapping_at(absent, name).get(ABSENT))
+        for name in {**absent, **told}
+    }
 
 
 def reached_s(run: RecordedRun) -> float:

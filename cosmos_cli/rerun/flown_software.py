@@ -76,6 +76,33 @@ def recorded_software(run: RunDirectory, today: Path | None) -> Iterator[Path]:
         yield folder
 
 
+@contextmanager
+def told_as_gap(run: RunDirectory, folder: Path) -> Iterator[None]:
+    """
+    Name what a run's copy lacks, where what is made of the copy has faults: a folder that is removed helps nobody.
+
+    Args:
+        run: The run.
+        folder: What is flown; if that is no copy of a run, faults stay as they are.
+
+    Raises:
+        InputError: As within.
+    """
+    try:
+        yield
+    except InputError as error:
+        is_copy = folder.is_relative_to((cache_folder() / FOLDER).resolve())
+        flown = flown_files_of(run) if is_copy else None
+        if flown is None or flown.is_whole or not flown.left_out:
+            raise
+        lacking = first_few([clean_line(each) for each in flown.left_out], SHOWN_MAX, "; ")
+        faults = [f"{each.path}: {each.text}" for each in error.all_faults] or [str(error)]
+        why = first_few(faults, SHOWN_MAX, "; ").replace(f"{folder}{os.sep}", "")
+        raise InputError(
+            f"{run.name}: its copy is not whole, and cannot be flown: {lacking} ({why}); {OTHERWISE}"
+        ) from error
+
+
 def _fill(run: RunDirectory, flown: FlownFiles, folder: Path, today: Path | None) -> None:
     """
     Put all files into a folder.

@@ -12,7 +12,7 @@ from typing import Final
 from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.document import read_document
 from cosmos_cli.models.scenario_outline import ScenarioOutline, is_scenario, read_outline
-from cosmos_cli.models.yaml_source import FILE_BYTES_MAX, read_source
+from cosmos_cli.models.yaml_source import FILE_BYTES_MAX, UTF_16, read_source
 from cosmos_cli.provision.trees import is_folder_of_tree, is_name_of_tree
 from cosmos_cli.testing.case import CaseSettings, SuiteCase, make_cases
 from cosmos_cli.testing.expression import Matcher
@@ -22,7 +22,9 @@ from madns_runtime.errors import MissingExtraError
 SUFFIXES: Final = (".yaml", ".yml")
 FILES_MAX: Final = 10_000
 CASES_MAX: Final = 20_000
-_SIMULATION: Final = re.compile(rb"^(?:simulation|extends)\s*:", re.MULTILINE)
+_SIMULATION: Final = re.compile(r"""(?:^|[{,])\s*["']?simulation["']?\s*:""", re.MULTILINE)
+_FIRST: Final = re.compile(r"^(?:---)?([ \t]*)(?!---)([^\s#%])", re.MULTILINE)
+"""The indentation and the first character of what is written at the top level."""
 DEFAULT_FOLDERS: Final = (Path("scenarios"), Path())
 """Looked into if no path is given: the first that is there."""
 
@@ -34,6 +36,8 @@ class FoundScenarios:
     outlines: list[ScenarioOutline] = field(default_factory=list)
     others: list[Path] = field(default_factory=list)
     """Files of folders that are YAML and no scenarios."""
+    links: list[Path] = field(default_factory=list)
+    """Links to folders, whose scenarios are not looked for: one may lead back."""
     faults: list[Fault] = field(default_factory=list)
 
 
@@ -55,21 +59,23 @@ def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
         raise InputError(f"{told}: no such file or folder; name scenarios or folders of them")
     seen: set[Path] = set()
     for path in paths or (next(each for each in DEFAULT_FOLDERS if each.is_dir()),):
-        for file, is_named in [(path, True)] if os.path.isfile(path) else _all_below(path):
+        files = [(path, True)] if os.path.isfile(path) else _all_below(path, found.links)
+        for file, is_named in files:
             if real_path(file) not in seen:
                 seen.add(real_path(file))
                 _add(found, file, is_named=is_named)
     return found
 
 
-def _all_below(folder: Path) -> list[tuple[Path, bool]]:
+def _all_below(folder: Path, links: list[Path]) -> list[tuple[Path, bool]]:
     try:
-        return _files_below(folder)
+        return _files_below(folder, links)
     except RecursionError:
         raise InputError(f"{folder}: folders nest too deeply there; name folders of it") from None
 
 
-def _files_below(folder: Path) -> list[tuple[Path, bool]]:
+def _files_below(folder: Path, links: list[Path]) -> list[tuple[Path, bool]]:
+    """Return files, none of them named; links to folders are added to *links*."""
     files: list[tuple[Path, bool]] = []
     for here, folders, names in os.walk(folder, onerror=_refuse):
         folders[:] = sorted(
@@ -77,6 +83,7 @@ def _files_below(folder: Path) -> list[tuple[Path, bool]]:
             for name in folders
             if is_name_of_tree(name) and is_folder_of_tree(Path(here) / name)
         )
+        links += [Path(here) / name for name in folders if os.path.islink(os.path.join(here, name))]
         files += [(Path(here) / name, False) for name in sorted(names) if name.endswith(SUFFIXES)]
         if len(files) > FILES_MAX:
             raise InputError(
@@ -108,9 +115,26 @@ def _add(found: FoundScenarios, file: Path, *, is_named: bool) -> None:
 def _seems_scenario(file: Path) -> bool:
     """Tell whether a file that is no proper YAML means to be a scenario: other programs have YAML of their own."""
     try:
-        return bool(_SIMULATION.search(read_regular_file(file, bytes_max=FILE_BYTES_MAX)))
+        raw = read_regular_file(file, bytes_max=FILE_BYTES_MAX)
     except OSError:
         return False
+    encoding = "utf-16" if raw.startswith(UTF_16) else "utf-8-sig"
+    text = raw.decode(encoding, errors="replace").replace("\0", "").replace("\r", "\n")
+    return bool(_SIMULATION.search(text)) or _has_scenarios_keys(text)
+
+
+def _has_scenarios_keys(text: str) -> bool:
+    """Tell whether keys of the top level are a scenario's: a service of Docker Compose extends another, too."""
+    first = _FIRST.search(text)
+    if first is None:
+        return False
+    indent, letter = first.groups()
+    before = r"(?:^|[{,])\s*" if letter == "{" else rf"^[ \t]{{0,{len(indent) + 1}}}"
+
+    def has(key: str) -> bool:
+        return re.search(rf"""(?m){before}["']?{key}["']?\s*:""", text) is not None
+
+    return has("extends") or (has("name") and has("agents"))
 
 
 @dataclass(slots=True, kw_only=True)
@@ -119,6 +143,8 @@ class ChosenCases:
 
     cases: list[SuiteCase] = field(default_factory=list)
     deselected: int = 0
+    left_out: list[str] = field(default_factory=list)
+    """Paths of folders' other files, and of links to folders."""
 
 
 def choose_cases(
@@ -142,7 +168,7 @@ def choose_cases(
     Raises:
         InputError: With every fault of every scenario that is meant.
     """
-    chosen = ChosenCases()
+    chosen = ChosenCases(left_out=[str(path) for path in (*found.others, *found.links)])
     faults = list(found.faults)
     messages: list[str] = []
     omitted = 0

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from cosmos_cli.errors import ExitCode, InputError, RunFailedError
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.models.baseline import Baseline
 from cosmos_cli.system.stop_signals import stop_signals_noted
@@ -186,9 +186,10 @@ def check_folder(runs: Path) -> None:
     Make the folder of the suite's runs.
 
     Raises:
-        RunFailedError: It cannot be made.
+        InputError: It cannot be made.
     """
     try:
         runs.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunFailedError(f"{runs}: cannot be made: {error.strerror}; name another") from error
+        cure = "choose another folder with --runs or COSMOS_RUNS"
+        raise InputError(f"{runs}: cannot be made: {error.strerror}; {cure}") from error

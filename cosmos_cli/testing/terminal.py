@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Sequence
 
 from cosmos_cli.testing.case import SuiteCase
+from cosmos_cli.testing.discovery import FoundScenarios
 from cosmos_cli.testing.outcome import CaseOutcome
 from cosmos_cli.testing.suite import SuiteResult
 from cosmos_cli.ui.foreign_text import clean_line
@@ -62,12 +63,14 @@ def summary_line(result: SuiteResult, *, deselected: int, seconds: float) -> str
     return _ruled(f"{', '.join(parts) or 'no tests ran'} in {seconds:.1f} s", "=")
 
 
-def collected_line(tests: int, *, scenarios: int, others: int, deselected: int) -> str:
-    """Return the line before the tests."""
+def collected_line(tests: int, found: FoundScenarios, *, deselected: int) -> str:
+    """Return the line before the tests: how many, and what folders hold beside their scenarios."""
+    others, links = len(found.others), len(found.links)
     told = [f"collected {counted(tests + deselected, 'test')}"]
     told += [f"{deselected} deselected, {tests} selected"] if deselected else []
     told += [f"{counted(others, 'YAML file')} not of scenarios"] if others else []
-    return f"{' / '.join(told)} ({counted(scenarios, 'scenario')})"
+    told += [f"{counted(links, 'link')} to folders not followed"] if links else []
+    return f"{' / '.join(told)} ({counted(len(found.outlines), 'scenario')})"
 
 
 def _ruled(text: str, mark: str) -> str:

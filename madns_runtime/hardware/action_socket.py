@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import fnmatch
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, get_type_hints
@@ -21,6 +22,7 @@ from madns_runtime.errors import ConfigurationError, MadnsError
 from madns_runtime.hardware.fault_actions import check_fault
 from madns_runtime.hardware.order_socket import LineSocket, Readers
 from madns_runtime.plain_values import from_mapping, is_real, shown, to_mapping
+from madns_runtime.similar_words import did_you_mean
 from madns_runtime.timeline.action import ActionKind
 from madns_runtime.timeline.kinds import DEVICE_FAULT, DeviceFault
 from madns_runtime.timeline.runner import OrderedAction, TimelineRunner
@@ -30,6 +32,14 @@ IN_FORCE_TOLD_MAX: Final = 100
 AGENTS_TOLD_MAX: Final = 20
 IN_FORCE_BYTES_MAX: Final = 65_536
 """Bytes of all actions in force that are told: a socket takes more at once, by default 160 KiB on a small board."""
+_PLAIN: Final = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "a text",
+    "bool": "true or false",
+}
+"""Python's kinds of values as a scenario's faults call them."""
+_KIND_EXPECTED: Final = re.compile(rf"\bexpected ({'|'.join(_PLAIN)}),")
 WHOLE_RUN: Final = "run"
 """Target of an action that acts on no agents."""
 
@@ -173,9 +183,8 @@ class ActionSocket:
         word, target = str(order.get("action")), str(order.get("target"))
         kind = self._kinds.get(word)
         if kind is None:
-            raise ConfigurationError(
-                f"no action {word!r} in this run; there are {', '.join(self._kinds)}"
-            )
+            hint = did_you_mean(word, self._kinds) or f"; there are {', '.join(self._kinds)}"
+            raise ConfigurationError(f"no action {word!r} in this run{hint}")
         parameters = order.get("parameters")
         given = dict(parameters) if isinstance(parameters, dict) else {}
         _take_texts(kind, given, order.get("texts"))
@@ -248,6 +257,9 @@ def _made(kind: ActionKind, given: Mapping[str, Any]) -> Any:
     """
     try:
         return from_mapping(kind.parameters, given, kind.word)
+    except ConfigurationError as error:
+        told = _KIND_EXPECTED.sub(lambda found: f"expected {_PLAIN[found[1]]},", str(error))
+        raise ConfigurationError(told) from error
     except MadnsError:
         raise
     except Exception as error:  # its own __post_init__ may raise anything

@@ -236,7 +236,8 @@ def test_a_run_without_checks_is_judged_by_none(run):
     refused = run.cosmos("judge", document["run"])
 
     assert refused.returncode == 2
-    assert "had no checks; name a scenario that has" in refused.stderr
+    assert "its scenario has no `checks:` (those of its simulation stand in" in refused.stderr
+    assert "name a scenario that has: cosmos judge " in refused.stderr
 
 
 DEVICES = """\

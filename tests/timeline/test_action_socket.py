@@ -86,6 +86,29 @@ def test_of_actions_that_are_long_to_tell_so_many_are_told_as_fit(tmp_path):
     assert answer["in_force_count"] == 100
 
 
+@pytest.mark.parametrize(
+    ("order", "refusal"),
+    [
+        ({"action": "hng"}, "no action 'hng' in this run, did you mean hang?"),
+        ({"action": "xyz"}, "no action 'xyz' in this run; there are annotate, "),
+        (
+            {"action": "step_clock", "parameters": {"by_ms": "5ms"}},
+            "step_clock.by_ms: expected a number, got '5ms'",
+        ),
+        (
+            {"action": "stress", "parameters": {"workers": "two"}},
+            "stress.workers: expected a whole number, got 'two'",
+        ),
+    ],
+)
+def test_an_order_that_is_none_is_refused_in_the_words_of_a_scenarios_faults(
+    tmp_path, order, refusal
+):
+    answer = answer_to({"target": "agent-0001", **order}, tmp_path)
+
+    assert answer["refusal"].startswith(refusal)
+
+
 FREEZE = {"device": "gps", "fault": "freeze"}
 
 

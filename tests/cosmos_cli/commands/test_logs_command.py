@@ -383,6 +383,10 @@ def test_agent_that_the_run_has_not_is_bad_input(talking, capsys):
 
     assert cosmos(["logs", "last", "agent-3"]) == 2
     assert "no agent, host or machine named agent-3, did you mean" in capsys.readouterr().err
+    assert cosmos(["logs", "last", "nobody"]) == 2
+    told = capsys.readouterr().err
+    assert "named nobody; there are host, agent-01, " in told
+    assert ", and as machines loopback" in told
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from harness.waiting import wait_until
 
 from cosmos_cli.app import run as cosmos
 from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.run_directory import RunDirectory, alone
 from cosmos_cli.launch.execute import RunOptions, manual_agents, plan_of
 from cosmos_cli.models.loading import load_scenario
 
@@ -151,6 +152,38 @@ def test_second_ctrl_c_still_collects_what_is_on_disk(
     assert run_json(environment)["status"] == "interrupted"
     assert not (directory / "report.html").exists()
     assert (directory / "manifest.json").exists()
+
+
+@pytest.mark.process
+def test_run_that_was_ended_at_once_is_interrupted_also_if_its_collection_was_cut_off(
+    environment: dict[str, str], scenario: Path
+) -> None:
+    stuck = {"runs_s": 60, "ignores_stop": True, "ignores_sigterm": True}
+    environment["COSMOS_FAKE"] = json.dumps({"host": stuck})
+    process = start(environment, str(scenario))
+    wait_for_note(environment, "launched [")
+    (folder,) = Path(environment["COSMOS_RUNS"]).glob("0001-tiny")
+    with alone(RunDirectory(folder)):  # the collection waits
+        process.send_signal(signal.SIGINT)
+        wait_for_note(environment, "told")
+        process.send_signal(signal.SIGINT)
+        wait_until(lambda: "interrupted" in run_json(environment), "word in run.json")
+        process.send_signal(signal.SIGINT)
+        code, _, err = finish(process)
+    again = subprocess.run(
+        [sys.executable, "-m", "cosmos_cli.start", "collect", str(folder), "--json"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=PATIENCE_S,
+    )
+
+    assert code == 130, err
+    assert "interrupted while collecting" in err
+    assert again.returncode == 5, again.stderr  # of the records, which this host did not leave
+    assert json.loads(again.stdout)["status"] == run_json(environment)["status"] == "interrupted"
+    assert run_json(environment)["exit_code"] == 130
+    assert "killed" not in str(run_json(environment)["verdict"])
 
 
 @pytest.mark.process

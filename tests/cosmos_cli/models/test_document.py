@@ -1,3 +1,5 @@
+import shlex
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -114,11 +116,40 @@ def test_faults_below_an_override_name_the_option():
     assert document.fault(("a",), "wrong").render().startswith("a.yaml:1:4: a: wrong")
 
 
+@pytest.mark.parametrize(
+    ("override", "path"),
+    [
+        ("x.b=1", ("x",)),
+        ("a.y.z=1", ("a", "y")),
+        ("l.0.k=1", ("l", 0)),
+        ("a.m[0].k=1", ("a", "m")),
+        ("a.m[0].k=1", ("a", "m", 0)),
+    ],
+)
+def test_what_an_override_makes_on_its_way_has_its_place_there(override, path):
+    """A section that --set misspells was blamed on the first line of a file that does not have it."""
+    document, faults = apply("a: {b: 1}\nl: []\nn:\n", override, "n.k=1")
+
+    assert faults == []
+    for at_key in (True, False):
+        assert document.fault(path, "", at_key=at_key).override == override.partition("=")[0]
+    assert document.fault(("n",), "").line == 3
+
+
 def test_override_that_would_be_dropped_is_refused():
     document, faults = apply("a: 1\n", "a=2", "a=3")
 
     assert document.value == {"a": 2}
     assert faults == ["--set a: is given twice, and only one could count"]
+
+
+@pytest.mark.parametrize("text", [":", "@home", "a: b: c", "% done", "it's: x: y"])
+def test_a_text_that_is_no_yaml_is_told_with_how_it_is_written(text):
+    _, (fault,) = apply("d: x\n", f"d={text}")
+
+    assert fault.startswith(f"--set d: expected a value, got {text!r}; write a text in quotes: ")
+    (written,) = shlex.split(fault.partition("quotes: --set ")[2])
+    assert apply("d: x\n", written)[0].value == {"d": text}
 
 
 def test_all_bad_overrides_are_named():

@@ -276,6 +276,69 @@ def test_sections_without_faults_are_checked_against_each_other_even_if_another_
     ]
 
 
+MANY = """\
+name: a
+simulation: counter
+seed: -1
+agents: {count: 3, tick_hz: 10}
+time: {duration_s: 5}
+placement: [{agents: [agent-09], machines: pi01}]
+agent_parameters: [{agents: [agent-08], parameters: {payload_byte: 500}}]
+checks:
+  - {name: b, stream: round_trip, field: packet, statistic: max, below: 10}
+  - {name: c, stream: round_trips, field: packet, statistic: max, below: ten}
+  - {name: d, event: agent_rejoined, agents: [host], before_s: 2, after: c}
+  - {name: d, stream: ticks, field: tick, agents: [agent-07], above: 1}
+timeline: [{at_s: 1, action: anotate, text: x}]
+"""
+
+
+@pytest.mark.parametrize("parameters", ["", "parameters: {payload_byte: 8}\n"])
+def test_faults_of_all_sections_come_at_once_and_none_that_follows_from_another(see, parameters):
+    """Those of checks, the timeline and parameters of some agents were told once all others were mended."""
+    shown = see(MANY + parameters)
+
+    places = [line.split(" ")[1] for line in shown.splitlines() if line.startswith("a.yaml")]
+    of_streams = ["checks[0].stream:"]  # which those are follows from the parameters
+    assert places == [
+        "seed:",
+        "placement[0].agents[0]:",
+        "agent_parameters[0].agents[0]:",
+        "agent_parameters[0].parameters.payload_byte:",
+        *([] if parameters else of_streams),
+        "checks[1].below:",
+        "checks[3].name:",
+        "checks[3].agents[0]:",
+        "timeline[0].action:",
+        *(["parameters.payload_byte:"] if parameters else []),
+    ]
+
+
+def test_streams_of_faulty_parameters_are_not_known_and_not_judged(see):
+    shown = see(
+        "name: a\nsimulation: counter\nagents: {count: 3}\nparameters: {payload_byte: 8}\n"
+        "checks: [{name: a, stream: own, field: x, agents: [host], unit: m, below: 1, stop_when_broken: true}]\n"
+        "timeline: [{when: {stream: own, field: x, agents: [host], unit: m, below: 1}, action: annotate, text: x}]\n"
+    )
+
+    assert shown.count("a.yaml") == 1
+    assert "parameters.payload_byte" in shown
+
+
+@pytest.mark.process
+def test_required_parameters_that_are_missing_are_told_once_beside_rules(see):
+    shown = see(
+        PLUGGED
+        + "parameters: {spare: 2}\n"
+        + "agent_parameters: [{agents: ['*'], parameters: {spare: 1.5}}]\n"
+    )
+
+    assert [line.split(" ")[1] for line in shown.splitlines() if line.startswith("a.yaml")] == [
+        "parameters.mass_kg:",
+        "agent_parameters[0].parameters.spare:",
+    ]
+
+
 PLUGGED = "name: a\nsimulation: ./p.py:simulation\nagents: {count: 3}\n"
 
 
@@ -379,6 +442,21 @@ def test_faults_of_overrides_name_the_option_and_come_last(see):
         --set parameters.service: expected best, reliable or sync, got 'bets', did you mean best?
         """
     )
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("tme.duration_s=5", "tme: unknown key, did you mean time?"),
+        ("time.duration.s=5", "time.duration: unknown key, did you mean duration_s?"),
+        ("hardware.devises[0].x=1", "hardware.devises: unknown key, did you mean devices?"),
+        ("agents.names[0]=a", "agents.names: expected 3 names (agents.count), got 1"),
+    ],
+)
+def test_a_section_that_an_override_makes_is_blamed_on_the_option(see, override, told):
+    shown = see("name: a\nsimulation: counter\nagents: {count: 3}\n", override)
+
+    assert shown == f"--set {override.partition('=')[0]}: {told}"
 
 
 def test_long_lines_are_shown_around_the_caret(see):

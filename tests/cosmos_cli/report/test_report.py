@@ -34,7 +34,7 @@ from madns_runtime.analysis.values import (
 )
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
-from madns_runtime.recording.records import EVENTS, LOG, Field, StreamSchema
+from madns_runtime.recording.records import EVENTS, LATE_TICKS, LOG, Field, StreamSchema
 
 INVARIANTS = StreamSchema(
     "invariants",
@@ -104,6 +104,27 @@ def test_statistics_are_of_all_samples_and_not_of_the_drawn_ones(tmp_path):
     np.testing.assert_allclose(row[2:9], expected, atol=5e-5)
     drawn = next(b for b in sections["Round trips"] if b.title == "Round trips by agent")
     assert len(drawn.choices[0].marks[0].x) <= 1500
+
+
+def test_missed_ticks_by_agent_sum_up_to_those_of_the_run(tmp_path):
+    """No tick follows the last ones that are missed, and no record tells of those of an agent that was killed."""
+    made = SyntheticRun(tmp_path, make_config(3, ticks=200))
+    for name, ticks in zip(made.names, (195, 200, 120), strict=True):
+        made.write_agent(name, last=ticks)
+    late = made.recorder("agents/agent-01", "agent-01", LATE_TICKS)
+    late.record("late_ticks", (195, 9000, 5, "wake_up"))
+    late.close()
+    result = made.result()
+    result["agents"]["agent-01"]["ticks"] |= {"run": 195, "missed": 5}
+    del result["agents"]["agent-03"]
+
+    document, sections = build(made, agents=result["agents"])
+
+    rows = table_of(sections["Real time"], "Ticks by agent").rows
+    missed = {row[0]: row[2] for row in rows}
+    assert missed == {"agent-01": 5, "agent-02": 0, "agent-03": 80}
+    assert sum(missed.values()) == document["timing"]["missed"]
+    assert "Missed ticks by agent" in titles(sections["Real time"])
 
 
 def test_constellation_gets_orbits_elements_and_conserved_quantities(tmp_path):

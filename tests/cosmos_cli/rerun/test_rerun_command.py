@@ -395,6 +395,33 @@ def test_a_copy_that_was_changed_or_escapes_is_refused(changed):
     assert "brake.py: a link that leads elsewhere" in done.stderr
 
 
+def test_what_a_copy_lacks_is_named_where_it_cannot_be_flown(tmp_path):
+    folder = tmp_path / "scenario"
+    folder.mkdir()
+    (tmp_path / "linked.py").write_text(FLIGHT)
+    (folder / "linked.py").symlink_to(tmp_path / "linked.py")
+    (folder / "s.yaml").write_text(
+        "name: s\nsimulation: constellation\nagents: {count: 1, tick_hz: 10}\n"
+        "time: {mode: lockstep, duration_s: 1}\n"
+        "parameters:\n  satellites: {walker: '56:1/1/0', altitude_km: 780}\n"
+        "  epoch_utc: '2026-01-01T00:00:00Z'\n  flight: linked.py:Brake\n"
+    )
+    cosmos = CosmosCommand(tmp_path, COSMOS_CACHE=str(tmp_path / "cache"))
+    flown = cosmos("run", folder / "s.yaml", "--no-report", "--quiet")
+
+    done = cosmos("rerun", "last", "--as-recorded")
+    elsewhere = cosmos("rerun", "last", "--as-recorded-from", folder)
+
+    assert flown.returncode == 0, flown.stderr
+    assert done.returncode == 2
+    assert "its copy is not whole, and cannot be flown: " in done.stderr
+    assert "linked.py: a link that leads out of the folder" in done.stderr
+    assert "flight: no such file: linked.py" in done.stderr
+    assert "--as-recorded-from DIR" in done.stderr
+    assert "cache" not in done.stderr
+    assert elsewhere.returncode == 0, elsewhere.stderr
+
+
 def test_a_run_of_before_there_were_copies_says_what_to_do(changed):
     cosmos, copy = changed
     document = json.loads((copy / "run.json").read_text())

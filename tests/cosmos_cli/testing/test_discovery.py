@@ -7,9 +7,11 @@ import pytest
 from harness.nested_folders import nested_folders
 
 from cosmos_cli.errors import InputError
+from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.testing.case import CaseSettings
 from cosmos_cli.testing.discovery import choose_cases, find_scenarios
 from cosmos_cli.testing.expression import parse_expression
+from cosmos_cli.testing.terminal import collected_line
 
 SCENARIO = """\
 name: {name}
@@ -55,6 +57,70 @@ def test_a_folders_scenarios_are_found_and_what_is_none_is_counted(folder):
     assert [outline.name for outline in found.outlines] == ["alpha", "beta", "gamma"]
     assert [path.name for path in found.others] == ["inventory.yaml", "list.yaml", "template.yml"]
     assert found.faults == []
+
+
+BROKEN = "name: f\nsimulation: counter\nagents: {count: 2}\nagents: {count: 3}\n"
+"""A scenario with a duplicate key."""
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"\xef\xbb\xbf" + BROKEN.partition("\n")[2].encode(), "duplicate key"),
+        (BROKEN.replace("simulation", '"simulation"').encode(), "duplicate key"),
+        (b"{name: f, simulation: counter, agents: {count: 2}, agents: {}}\n", "duplicate key"),
+        (b"--- {name: f, 'extends': a.yaml, name: g}\n", "duplicate key"),
+        ("".join(f"  {line}\n" for line in BROKEN.splitlines()).encode(), "duplicate key"),
+        (BROKEN.replace("\n", "\r").encode(), "duplicate key"),
+        (BROKEN.encode("utf-16"), "got UTF-16"),
+        (BROKEN.encode("utf-16-le"), "got binary data"),
+        (BROKEN.replace("simulation:", "  simulation:").encode(), ""),
+        (BROKEN.replace("simulation:", "simulaton:").encode(), "duplicate key"),
+        (b"name: f\nsimulaton: counter\nagents: {count: 2}\n", "did you mean simulation"),
+        (b"nmae: f\nsimulation: counter\nagents: {count: 2}\n", "did you mean name"),
+        (b"name: f\nagents: {names: [a]}\n", "simulation: "),
+    ],
+)
+def test_a_broken_scenario_of_a_folder_is_at_fault_however_it_is_written(folder, content, told):
+    """It was judged as long as it was right: dropping it would end a suite well that it should end with 2."""
+    (folder / "broken.yaml").write_bytes(content)
+
+    with pytest.raises(InputError) as caught:
+        chosen(find_scenarios([folder]))
+    with pytest.raises(InputError) as validated:
+        load_scenario(folder / "broken.yaml", [], warn=print)
+    assert caught.value.faults == validated.value.faults
+    assert any(told in f"{fault.path}: {fault.text}" for fault in caught.value.faults)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "name: ci\non: push\njobs: {a: {runs-on: x}}\n",
+        "name: app\nservices:\n  a:\n    extends: b\n",
+        "name: app\nservices:\n  a:\n    extends: b\n    extends: c\n",
+        "name: build\nagents: {queue: x}\nsteps: []\n",
+        "simulation: counter\nagents: {count: 2}\n",
+        "figures: {a: {path: seed}}\nfigures: {}\n",
+    ],
+)
+def test_files_of_other_programs_are_left_out(folder, content):
+    (folder / "other.yaml").write_text(content)
+    found = find_scenarios([folder])
+
+    assert found.faults == []
+    assert folder / "other.yaml" in found.others
+    assert str(folder / "other.yaml") in chosen(found).left_out
+
+
+def test_links_to_folders_are_told_as_left_out(folder):
+    found = find_scenarios([folder])
+
+    assert found.links == [folder / "deep/loop"]
+    assert chosen(found).left_out[-1] == str(folder / "deep/loop")
+    assert "3 YAML files not of scenarios / 1 link to folders not followed (3 scenarios)" in (
+        collected_line(3, found, deselected=0)
+    )
 
 
 def test_a_link_to_itself_is_no_scenario(folder):

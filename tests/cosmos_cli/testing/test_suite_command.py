@@ -135,7 +135,14 @@ def test_baselines_are_written_and_hold_the_run_to_them(cosmos):
         "  ticks: {expected: 100, path: timing.ticks}\n"
         "  packets: {stream: round_trips, field: packet, statistic: max, expected: 49}\n"
     )
-    written = cosmos("test", "--update-baselines", "--set", "time.duration_s=6")
+    before = file.read_bytes()
+    refused = cosmos("test", "--update-baselines", "--set", "time.duration_s=6")
+    assert (refused.returncode, file.read_bytes()) == (2, before)
+    assert "and --set (but that of deadline.* and time.rtf_tolerance)" in refused.stderr
+    file.write_text(file.read_text().replace("100", "99").replace("49", "48"))
+    loose = ("--set", "deadline.max_miss_ratio=1", "--set", "time.rtf_tolerance=1")
+    written = cosmos("test", "--update-baselines", *loose)
+    assert file.read_bytes() == before
     assert "scenarios/figures.yaml: 2 expected values written" in written.stderr
     file.write_text(
         "figures:\n"
@@ -202,7 +209,9 @@ def test_ctrl_c_ends_all_runs_cleanly_and_tells_what_was_found(cosmos, monkeypat
         (("--set", "test.deadline_s=1"), "--set test.deadline_s: changes nothing"),
         (("--set", "test={tags: [x]}"), "--set test: changes nothing"),
         (("--update-baselines", "--seeds", "1"), "leave out --seeds"),
-        (("--update-baselines", "--realtime-max", "1"), "and --realtime-max"),
+        (("--update-baselines", "--realtime-max", "1"), "--full-length, --realtime-max"),
+        (("--update-baselines", "--set", "seed=4"), "leave out --seeds"),
+        (("--runs", "scenarios/s.yaml/runs"), "tests: cannot be made: Not a directory; choose"),
         (("empty",), "no tests: no scenarios there"),
     ],
 )

@@ -52,6 +52,23 @@ def test_verdicts_exit_code_survives_an_output_that_takes_nothing(
 
 
 @pytest.mark.process
+@pytest.mark.parametrize(("limit", "code"), [(100, 0), (0, 4)])
+def test_verdicts_exit_code_survives_talk_that_nothing_takes(
+    tmp_path: Path, limit: int, code: int
+) -> None:
+    """The interpreter ends with 120 where it cannot write what is left of its talk."""
+    scenario = tmp_path / "a.yaml"
+    check = f"{{name: few, stream: round_trips, field: packet, statistic: max, below: {limit}}}"
+    scenario.write_text(f"{TINY}checks: [{check}]\n")
+
+    ended = shell(
+        f"{sys.executable} -m cosmos_cli.start run {scenario} --runs {tmp_path / 'runs'} --no-report 2>/dev/full"
+    )
+
+    assert ended.returncode == code, ended.stdout
+
+
+@pytest.mark.process
 def test_verdicts_exit_code_survives_a_reader_that_has_gone(run_path: Path) -> None:
     ended = shell(f"{COSMOS} collect {run_path} -q --json {TO_NOBODY}")
 
