@@ -27,7 +27,7 @@ IDENTITY = ("agent", "satellite", "sender", "to", "receiver", "station", "kind",
 TIMES = ("t_s", "commanded_s", "sent_s", "rise_s", "at_s")
 """Fields of a time, in the order in which they are tried."""
 PACKET = "packet"
-"""Field that counts one message every tick, as the counter's do; beside a time it counts something else."""
+"""Field that numbers one message every tick, where nothing tells the time; beside a time it numbers something else."""
 RANK = "number"
 """Field of a record's own number: those of one time are pairs in its order, whenever each was recorded."""
 OWNERS = ("agent", "sender")
