@@ -44,7 +44,7 @@ from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.config import Agents, to_mapping
 from madns_runtime.errors import ConfigurationError, MadnsError, PluginError
 from madns_runtime.plugin.api import DeclaredStream, DeviceUse, PlaceUse, Simulation
-from madns_runtime.plugin.code_places import blame, place_of
+from madns_runtime.plugin.code_places import blame, place_of_class
 from madns_runtime.plugin.columns import label_column_remarks, unknown_columns
 from madns_runtime.plugin.isolation import is_interruption, said
 from madns_runtime.plugin.queries import (
@@ -277,7 +277,7 @@ class _Asking:
             return None
         except ConfigurationError as error:  # what the scenario gives was found right above
             told = str(error).removeprefix("parameters.")
-            texts = [f"{_place(kind)}.{told}; a default must be of its field's type"]
+            texts = [f"{place_of_class(kind)}.{told}; a default must be of its field's type"]
         except MadnsError as error:
             texts = [str(error)]
         except BaseException as error:  # a plug-in's class may raise anything
@@ -289,7 +289,7 @@ class _Asking:
             wrong = list(not_sendable(made, ()))
             if not wrong and not is_same(made, found):
                 wrong = [changed(made, found)]
-            texts = [f"{_place(kind)}: {text}" for text in wrong]
+            texts = [f"{place_of_class(kind)}: {text}" for text in wrong]
         self._blame(*texts)
         return None if texts or opened else parameters
 
@@ -392,11 +392,6 @@ class _Asking:
         except MadnsError as error:
             self._blame(str(error))
             return ()
-
-
-def _place(kind: type) -> str:
-    """Return where a class of parameters stands, and its name: for a fault alone, as its file is read for it."""
-    return f"{place_of(kind)}: {kind.__name__}"
 
 
 def _is_lockstep(document: Document) -> bool:

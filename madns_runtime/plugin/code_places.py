@@ -30,6 +30,11 @@ def place_of(thing: Any) -> str:
     return f"{file}:{line}"
 
 
+def place_of_class(kind: type) -> str:
+    """Return where a class stands, and its name: for a fault alone, as its file is read for it."""
+    return f"{place_of(kind)}: {kind.__name__}"
+
+
 def line_of(thing: Any) -> str:
     """Return NAME OF THE FILE:line where a function or class is written; empty if that is not known."""
     try:
