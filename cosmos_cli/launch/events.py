@@ -13,8 +13,9 @@ from typing import Any
 
 import orjson
 
+from cosmos_cli.evidence.run_documents import LEVELS_MAX
 from cosmos_cli.ui.foreign_text import clean_line
-from madns_runtime.plain_values import mapping_at
+from madns_runtime.plain_values import is_nested_deeper, mapping_at
 from madns_runtime.recording.newest_values import Value, clean_values
 
 NOISE_CHARACTERS_MAX = 500
@@ -218,7 +219,9 @@ def _progress(d: Mapping[str, Any]) -> Event:
 
 def _finished(d: Mapping[str, Any]) -> Event:
     result = d.get("result")
-    return Finished(result if isinstance(result, dict) else None)
+    # One that is nested deeper could not be written down; what lies beside the records may be another.
+    is_fit = isinstance(result, dict) and not is_nested_deeper(result, LEVELS_MAX)
+    return Finished(result if is_fit else None)
 
 
 def _exited(d: Mapping[str, Any]) -> Event:
