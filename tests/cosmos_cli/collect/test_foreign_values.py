@@ -1,6 +1,8 @@
 """Values of a run's files that readers of JSON take and its writers refuse: each is told, and costs no verdict."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 from harness.synthetic_run import SyntheticRun
@@ -192,3 +194,36 @@ def test_the_deepest_summary_that_a_host_may_return_is_handed_over_and_judged(ma
     assert len(operator.told) == 1
     assert collected(made).exit_code == 0
     assert finish_run(made.run, result, made.expected).exit_code == 0
+
+
+GATHERED = """
+import resource, sys
+from pathlib import Path
+from cosmos_cli.evidence.run_directory import RunDirectory
+from cosmos_cli.evidence.tabulate import gather
+
+pages = int(Path("/proc/self/statm").read_text().split()[0])
+bound = pages * resource.getpagesize() + (1 << 29)
+resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
+gathered = gather(RunDirectory(Path(sys.argv[1])), None, lambda what, share: None)
+print([scan.records for scan in gathered.scans], *gathered.faults)
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("kind", ["float", "int"])
+def test_a_long_text_among_many_numbers_is_null_and_needs_no_memory(tmp_path, kind):
+    """NumPy made as long a text of each number: 3.8 GiB of a file of 128 KB."""
+    folder = tmp_path / "0001-x/agents/a"
+    folder.mkdir(parents=True)
+    fields = [{"name": "x", "unit": "m", "kind": kind}]
+    header = {"schema": 1, "source": "a", "stream": "state", "shape": "array", "fields": fields}
+    end = {"end": {"records": 17_001, "dropped": 0, "not_finite": 0}}
+    text = json.dumps(["A" * 60_000])
+    lines = [json.dumps(header), *["[1]"] * 14_000, text, *["[2]"] * 3_000, json.dumps(end), ""]
+    (folder / "state.jsonl").write_text("\n".join(lines))
+
+    argv = [sys.executable, "-c", GATHERED, str(tmp_path / "0001-x")]
+    child = subprocess.run(argv, capture_output=True, text=True, check=False)
+
+    assert child.stdout.startswith("[17001] tables/state.parquet: 1 recorded values"), child.stderr
