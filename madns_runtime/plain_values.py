@@ -45,6 +45,17 @@ def mapping_at(mapping: Mapping[str, Any] | None, *keys: str) -> Mapping[str, An
     return value if isinstance(value, Mapping) else {}
 
 
+def is_nested_deeper(value: object, levels: int) -> bool:
+    """Tell whether lists and mappings of a JSON value lie in each other on more than *levels* levels."""
+    layer: list[Any] = [value] if isinstance(value, (dict, list)) else []
+    for _ in range(levels):
+        inner = (each.values() if isinstance(each, dict) else each for each in layer)
+        layer = [item for items in inner for item in items if isinstance(item, (dict, list))]
+        if not layer:
+            return False
+    return bool(layer)
+
+
 def written_name(cls: type, field: str) -> str:
     """
     Return the key of a dataclass's field.

@@ -143,9 +143,8 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
     )
     gathered = dataclasses.replace(gathered, scans=with_told_counts(gathered.scans, result))
     changed |= earlier.changed_streams(run, gathered.by_path(), gathered.unread)
-    fault = fault_of_plan(run.plan_json)
-    if fault is not None:
-        changed.setdefault(run.plan_json.name, f"{fault}; what was planned is not known")
+    for name, fault in _unusable(run, result).items():
+        changed.setdefault(name, fault)
     if earlier.fault:
         changed[run.manifest_json.name] = earlier.fault
     gathered = dataclasses.replace(
@@ -160,6 +159,20 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
         has_report=has_report,
         progress=progress,
     )
+
+
+def _unusable(run: RunDirectory, result: Mapping[str, Any] | None) -> dict[str, str]:
+    """Return by file why what was planned, and what the host reported, is not known though the file is there."""
+    found: dict[str, str] = {}
+    plan_fault = fault_of_plan(run.plan_json)
+    if plan_fault is not None:
+        found[run.plan_json.name] = f"{plan_fault}; what was planned is not known"
+    for path in (run.result_json, run.left_result_json) if result is None else ():
+        fault = fault_of(path)
+        if fault not in (None, MISSING):
+            name = path.relative_to(run.path).as_posix()
+            found[name] = f"{fault}; what the host reported is not known"
+    return found
 
 
 def _remove_sockets(run: RunDirectory) -> None:

@@ -22,8 +22,9 @@ from typing import Any, Literal, TypeGuard, get_args
 
 from cosmos_cli.collect.disk import hash_of, local_disk
 from cosmos_cli.collect.machine_sources import MACHINES, RecordingMachine, RecordingMachines
-from cosmos_cli.collect.remote_manifest import MANIFEST_NAME, RETRIEVED_NAME
+from cosmos_cli.collect.remote_manifest import MANIFEST_NAME, RETRIEVED_NAME, shown
 from cosmos_cli.errors import InputError
+from cosmos_cli.evidence.completeness import COUNT_MAX
 from cosmos_cli.evidence.run_directory import SCHEMA, RunDirectory, utc_now, write_json
 from cosmos_cli.evidence.run_documents import Problem
 
@@ -107,12 +108,25 @@ def write_manifest(
     Raises:
         MachineFailure: The disk here fails.
     """
-    files = {str(e["path"]): {k: v for k, v in e.items() if k != "path"} for e in entries}
+    files = {str(entry["path"]): _kept(entry) for entry in entries}
     _write(
         run,
         note_path(run, machine).with_name(MANIFEST_NAME),
         {"sha256": manifest_sha256, "files": files},
     )
+
+
+def _kept(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is kept of a file's entry that was checked: no more than is known to be fit for a file of JSON."""
+    kept: dict[str, Any] = {}
+    for name in ("bytes", "mtime_s"):
+        number = entry.get(name)
+        if isinstance(number, int) and not isinstance(number, bool) and abs(number) <= COUNT_MAX:
+            kept[name] = number
+    if "kind" not in entry:
+        return {**kept, "sha256": entry["sha256"]}
+    kind = entry["kind"]
+    return {**kept, "kind": shown(kind) if isinstance(kind, str) else "no file"}
 
 
 def _write(run: RunDirectory, path: Path, values: Mapping[str, Any]) -> None:

@@ -193,5 +193,5 @@ def _add(*counts: Mapping[str, Any]) -> dict[str, int]:
     for mapping in counts:
         for reason, count in mapping.items():
             if isinstance(count, int) and not isinstance(count, bool):
-                total[reason] = total.get(reason, 0) + count
+                total[reason] = total.get(reason, 0) + whole_count(count)
     return total

@@ -6,8 +6,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
+from cosmos_cli.evidence.completeness import COUNT_MAX
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import read_object
 from cosmos_cli.evidence.verdict import CheckResult, at_most, is_number
@@ -288,12 +289,11 @@ def _stimulus(told: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
             zeros: dict[str, Any] = {**dict.fromkeys(POINT_COUNTS, 0), "underruns": 0}
             joined = found.setdefault(clean_line(str(channel)), zeros)
             for name in zeros.keys() - {"lateness_us"}:
-                number = mapping_at(counts).get(name)
-                joined[name] += int(number) if is_number(number) else 0
+                joined[name] = int(_added(joined[name], mapping_at(counts).get(name)))
             lateness = joined.setdefault("lateness_us", {})
             for name in ("p50", "p99", "max"):
                 value = mapping_at(counts, "lateness_us").get(name)
-                if is_number(value):
+                if _is_count(value):
                     lateness[name] = max(lateness.get(name, 0), int(value))
     return found
 
@@ -309,19 +309,23 @@ def _silent_inputs(told: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _sum(told: Iterable[Mapping[str, Any]], key: str) -> int | None:
     values = [each.get(key) for each in told]
-    numbers = [int(value) for value in values if is_number(value)]
-    return sum(numbers) if len(numbers) == len(values) else None
+    numbers = [int(value) for value in values if _is_count(value)]
+    total = sum(numbers)
+    return total if len(numbers) == len(values) and abs(total) <= COUNT_MAX else None
 
 
 def _frozen(told: Iterable[Mapping[str, Any]]) -> int | None:
-    """Return how often inputs were frozen; None if a driver's process ended without its report."""
+    """Return how often inputs were frozen; None if a driver's process ended without its report, or told no count."""
     total = 0
     for each in told:
         frozen = each.get("frozen")
         if not isinstance(frozen, Mapping):
             return None
-        total += sum(int(times) for times in frozen.values() if is_number(times))
-    return total
+        numbers = [times for times in frozen.values() if is_number(times)]
+        if not all(map(_is_count, numbers)):
+            return None
+        total += sum(map(int, numbers))
+    return total if abs(total) <= COUNT_MAX else None
 
 
 def _counts(told: Iterable[Mapping[str, Any]]) -> dict[str, float]:
@@ -329,7 +333,17 @@ def _counts(told: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     found: dict[str, float] = {}
     for each in told:
         for key, value in each.items():
-            if key not in _TOLD_APART and is_number(value):
+            if key not in _TOLD_APART and _is_count(value):
                 name = clean_line(str(key))
-                found[name] = found.get(name, 0) + value
+                found[name] = _added(found.get(name, 0), value)
     return found
+
+
+def _added(total: float, value: object) -> float:
+    """Return a sum of counts with another one; as it is with what is none, or would make it none."""
+    return total + value if _is_count(value) and _is_count(total + value) else total
+
+
+def _is_count(value: object) -> TypeGuard[float]:
+    """Tell whether a value from a file is a number that run.json can hold, and so can a sum of some."""
+    return is_number(value) and abs(value) <= COUNT_MAX

@@ -14,9 +14,12 @@ from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.bounded_files import read_regular_file
 from madns_runtime.config import RunConfig, from_mapping
 from madns_runtime.errors import ConfigurationError
+from madns_runtime.plain_values import is_nested_deeper
 
 DOCUMENT_BYTES_MAX = 256 * 1024 * 1024
 """A host's result is some kilobytes per agent, a manifest some 200 bytes per file."""
+LEVELS_MAX = 220
+"""Lists and mappings in each other: a plug-in's summary may have 200. More than 254 are read, but cannot be written."""
 SCHEMA = 1
 """Version of run.json and manifest.json; a change that breaks a reader raises it."""
 EXPECTATIONS = "expectations"
@@ -31,11 +34,13 @@ def read_object(path: Path) -> dict[str, Any]:
 
     Raises:
         OSError: It is missing, no regular file, or too large.
-        ValueError: It is something else.
+        ValueError: It is something else, or nested too deep.
     """
     value = orjson.loads(read_regular_file(path, bytes_max=DOCUMENT_BYTES_MAX))
     if not isinstance(value, dict):
         raise ValueError(f"expected a JSON object, got {type(value).__name__}")
+    if is_nested_deeper(value, LEVELS_MAX):
+        raise ValueError(f"expected at most {LEVELS_MAX} lists and objects in each other")
     return value
 
 

@@ -252,9 +252,13 @@ def read_batches(file: RecordFile, reading: StreamReading) -> Iterator[tuple[Col
         yield {DETAILS.name: details, **columns}, len(records)
 
 
-def _details(record: Mapping[str, Any], names: Sequence[str]) -> str | None:
+def _details(record: Mapping[str, Any], names: Sequence[str]) -> str | dict[str, Any] | None:
+    """Return as JSON what a record carries beside its fields; as it is where it is nested deeper than orjson writes."""
     rest = {key: value for key, value in record.items() if key not in names}
-    return orjson.dumps(rest).decode() if rest else None
+    try:
+        return orjson.dumps(rest).decode() if rest else None
+    except TypeError:
+        return rest
 
 
 def _objects(values: list[Any]) -> NDArray[Any]:

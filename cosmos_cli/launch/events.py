@@ -13,9 +13,10 @@ from typing import Any
 
 import orjson
 
+from cosmos_cli.evidence.run_documents import LEVELS_MAX
 from cosmos_cli.ui.foreign_text import clean_line
-from madns_runtime.plain_values import mapping_at
-from madns_runtime.recording.newest_values import Value, clean_values
+from madns_runtime.plain_values import is_nested_deeper, mapping_at
+from madns_runtime.recording.newest_values import WHOLE_MAX, Value, clean_values
 
 NOISE_CHARACTERS_MAX = 500
 """Characters shown of a line that is no event."""
@@ -189,7 +190,7 @@ def parse_event(line: bytes) -> Event:
     try:
         document = orjson.loads(line)
         return _PARSERS[document["event"]](document)
-    except (orjson.JSONDecodeError, KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         return Noise(line.decode(errors="replace").strip()[:NOISE_CHARACTERS_MAX])
 
 
@@ -199,26 +200,28 @@ def _progress(d: Mapping[str, Any]) -> Event:
     return Progress(
         t_s=_float(d.get("t_s")),
         rtf=_float(d.get("rtf")),
-        ready=int(d.get("ready") or 0),
-        running=int(d.get("running") or 0),
-        lost=int(d.get("lost") or 0),
-        complete=int(d.get("complete") or 0),
-        ticks=int(d.get("ticks") or 0),
-        missed=int(d.get("missed") or 0),
+        ready=_whole(d.get("ready") or 0),
+        running=_whole(d.get("running") or 0),
+        lost=_whole(d.get("lost") or 0),
+        complete=_whole(d.get("complete") or 0),
+        ticks=_whole(d.get("ticks") or 0),
+        missed=_whole(d.get("missed") or 0),
         lateness_us_p50=_float(d.get("lateness_us_p50")),
         lateness_us_p99=_float(d.get("lateness_us_p99")),
-        lost_messages=int(d.get("lost_messages") or 0),
-        records_dropped=int(d.get("records_dropped") or 0),
+        lost_messages=_whole(d.get("lost_messages") or 0),
+        records_dropped=_whole(d.get("records_dropped") or 0),
         is_lockstep=bool(d.get("is_lockstep")),
         columns=columns,
         values={str(agent): clean_values(own, len(columns)) for agent, own in values.items()},
-        values_left_out=int(d.get("values_left_out") or 0),
+        values_left_out=_whole(d.get("values_left_out") or 0),
     )
 
 
 def _finished(d: Mapping[str, Any]) -> Event:
     result = d.get("result")
-    return Finished(result if isinstance(result, dict) else None)
+    # One that is nested deeper could not be written down; what lies beside the records may be another.
+    is_fit = isinstance(result, dict) and not is_nested_deeper(result, LEVELS_MAX)
+    return Finished(result if is_fit else None)
 
 
 def _exited(d: Mapping[str, Any]) -> Event:
@@ -226,7 +229,7 @@ def _exited(d: Mapping[str, Any]) -> Event:
     how = d.get("how") or (f"killed by {signal_name}" if signal_name else f"exit code {code}")
     return AgentExited(
         str(d["agent"]),
-        int(d["pid"]),
+        _whole(d["pid"]),
         str(how),
         is_abnormal=signal_name is not None or code != 0,
         is_on_purpose=bool(d.get("on_purpose")),
@@ -239,26 +242,39 @@ def _line(value: Any) -> str:
     return clean_line(str(value))
 
 
+def _whole(value: Any) -> int:
+    """
+    Return a whole number that can be told again.
+
+    Raises:
+        ValueError: It is none, or one beyond what all readers of JSON agree on.
+    """
+    number = int(value)
+    if abs(number) > WHOLE_MAX:
+        raise ValueError("a number beyond all counts")
+    return number
+
+
 def _float(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
 _PARSERS: Mapping[str, Callable[[Mapping[str, Any]], Event]] = {
-    "listening": lambda d: Listening(str(d["address"]), int(d["port"])),
+    "listening": lambda d: Listening(str(d["address"]), _whole(d["port"])),
     "state": lambda d: StateChanged(str(d["state"])),
     "agent": lambda d: AgentChanged(str(d["agent"]), str(d["state"])),
     "progress": _progress,
     "log": lambda d: Logged(str(d["level"]), str(d.get("source") or ""), str(d["text"])),
     "finished": _finished,
     "started": lambda d: AgentStarted(
-        str(d["agent"]), int(d["pid"]), int(d.get("incarnation") or 1)
+        str(d["agent"]), _whole(d["pid"]), _whole(d.get("incarnation") or 1)
     ),
     "exited": _exited,
     "device": lambda d: DeviceChanged(
         _line(d["device"]), _line(d["status"]), _line(d.get("why") or "")
     ),
-    "injected": lambda d: FaultInserted(int(d["order"]), _line(d.get("refusal") or "")),
-    "process": lambda d: ProcessKnown(int(d["pid"])),
+    "injected": lambda d: FaultInserted(_whole(d["order"]), _line(d.get("refusal") or "")),
+    "process": lambda d: ProcessKnown(_whole(d["pid"])),
     "loading": lambda d: Loading(str(d["doing"])),
-    "pong": lambda d: PingAnswered(int(d["n"])),
+    "pong": lambda d: PingAnswered(_whole(d["n"])),
 }

@@ -17,6 +17,7 @@ import orjson
 from cosmos_cli.fleet.connection import Stream
 from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.launch.channel import StreamChannel
+from madns_runtime.recording.newest_values import WHOLE_MAX
 
 COMMANDS_KEPT_MAX = 10_000
 """Commands of a run that could be sent again; a run of thousands of agents has fewer."""
@@ -118,8 +119,8 @@ class RemoteLine:
     def _heard(self, line: bytes) -> None:
         try:
             event = orjson.loads(line)
-            number, commands = int(event.get("number", 0)), int(event.get("commands", 0))
-        except (orjson.JSONDecodeError, AttributeError, TypeError, ValueError, OverflowError):
+            number, commands = _number(event.get("number", 0)), _number(event.get("commands", 0))
+        except (AttributeError, TypeError, ValueError, OverflowError):
             event, number, commands = {}, 0, 0
         if event.get("event") == "attached":
             self.has_greeted = True
@@ -140,3 +141,9 @@ class RemoteLine:
                 f"{missing} of its events did not fit while its connection was broken, and are lost"
             )
             self._on_line(orjson.dumps({"event": "log", "level": "warning", "text": text}))
+
+
+def _number(value: Any) -> int:
+    """Return the number of an event or a command; 0, as of a line without one, for one that could not be told back."""
+    number = int(value)
+    return number if 0 <= number <= WHOLE_MAX else 0

@@ -20,7 +20,7 @@ from madns_runtime.config import RunConfig
 from madns_runtime.declared_bounds import bound_faults
 from madns_runtime.errors import ConfigurationError, MadnsError
 from madns_runtime.hardware.fault_actions import check_fault
-from madns_runtime.hardware.order_socket import LineSocket, Readers
+from madns_runtime.hardware.order_socket import TOO_DEEP, LineSocket, Readers
 from madns_runtime.plain_values import from_mapping, is_real, shown, to_mapping
 from madns_runtime.similar_words import did_you_mean
 from madns_runtime.timeline.action import ActionKind
@@ -148,6 +148,9 @@ class ActionSocket:
                 self._socket.tell(number, self._listed())
                 return
             self._waiting.append((number, self._parsed(order)))
+        except RecursionError:
+            self._socket.tell(number, {"refusal": TOO_DEEP})
+            return
         except (ValueError, TypeError, MadnsError) as error:
             self._socket.tell(number, {"refusal": str(error)})
             return

@@ -23,6 +23,8 @@ from madns_runtime.plain_values import is_real
 SOCKET_NAME: Final = ".orders.sock"
 LINE_BYTES_MAX: Final = 65_536
 """Bytes of an order: the longest text that an action takes fits in several times."""
+TOO_DEEP: Final = "a value is nested too deep"
+"""Why an order is refused of which something cannot even be shown."""
 CLIENTS_MAX: Final = 8
 """With one more, the connection of the client that has waited longest is closed."""
 
@@ -157,6 +159,8 @@ class OrderSocket(LineSocket):
             value = order["value"]
             fault = (str(order["target"]), str(order["action"]), _number(value))
             check_fault(fault[1], fault[2])
+        except RecursionError:
+            self.answer(number, f"no order: {TOO_DEEP}")
         except (ValueError, KeyError, TypeError, MadnsError) as error:
             self.answer(number, f"no order: {error}")
         else:

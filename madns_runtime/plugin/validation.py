@@ -9,7 +9,7 @@ from typing import Any, Final
 import orjson
 
 from madns_runtime.errors import PluginError
-from madns_runtime.plain_values import is_real
+from madns_runtime.plain_values import is_nested_deeper, is_real
 from madns_runtime.protocol.codec import (
     DEPTH_MAX,
     ITEMS_MAX,
@@ -24,6 +24,9 @@ from madns_runtime.recording.encoding import count_not_finite
 
 SUMMARY_BYTES_MAX = 1024 * 1024
 """A summary is figures; what is longer belongs into a stream of records."""
+SUMMARY_LEVELS_MAX = 200
+"""Lists and mappings of a summary in each other: it lies in the host's result, and that in messages and in run.json, of
+which none may have 255 levels."""
 NOT_FINITE_CHECK = "summary.not_finite"
 
 
@@ -82,7 +85,7 @@ def summary(value: Any) -> dict[str, Any]:
     JSON has no number that is not finite: such values are null there, and a broken check tells of them.
 
     Raises:
-        PluginError: It is no mapping, too large, or has no JSON form.
+        PluginError: It is no mapping, too large, nested too deep, or has no JSON form.
     """
     if not isinstance(value, Mapping):
         raise PluginError(f"{_kind(value)}: expected a mapping; is a return missing?")
@@ -95,6 +98,10 @@ def summary(value: Any) -> dict[str, Any]:
             f"a summary of {len(text)} bytes: expected at most {SUMMARY_BYTES_MAX}; record long data"
         )
     plain: dict[str, Any] = orjson.loads(text)
+    if is_nested_deeper(plain, SUMMARY_LEVELS_MAX):
+        raise PluginError(
+            f"a summary of more than {SUMMARY_LEVELS_MAX} lists and mappings in each other: a summary is figures"
+        )
     not_finite = count_not_finite({key: item for key, item in value.items() if key != "checks"})
     checks = plain.setdefault("checks", []) if not_finite else None
     if isinstance(checks, list):

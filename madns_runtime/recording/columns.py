@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from types import NoneType
 from typing import Any, Final
@@ -44,9 +45,11 @@ def _number_column(values: list[Any], wanted: type[np.float64 | np.int64]) -> ND
     """
     if not values:
         return np.empty(0, dtype=wanted)
-    column = np.array(values)
-    if column.ndim == 1 and column.dtype.kind in ("ib" if wanted is np.int64 else "fib"):
-        return column.astype(wanted, copy=False)
+    try:
+        # NumPy is not asked first: of one long text among many numbers it makes as long a text for each.
+        return np.frombuffer(array("q" if wanted is np.int64 else "d", values), dtype=wanted)
+    except (TypeError, OverflowError):
+        pass  # Not numbers alone, or whole ones among which there is another.
     if not _NUMBERS.issuperset(map(type, values)):
         raise ValueError("a value is no number")
     if wanted is np.int64 and any(type(each) is int and abs(each) > WHOLE_MAX for each in values):

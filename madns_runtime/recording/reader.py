@@ -18,7 +18,7 @@ import orjson
 
 from madns_runtime.bounded_files import open_regular_file
 from madns_runtime.errors import MachineError
-from madns_runtime.recording.columns import Columns, column_of, joined_column
+from madns_runtime.recording.columns import WHOLE_MAX, Columns, column_of, joined_column
 from madns_runtime.recording.stream_rules import CONTROL_KEYS
 
 BLOCK_BYTES = 1 << 17
@@ -251,11 +251,15 @@ class _Decoder:
             return True
         end = value["end"]
         counts: list[Any] = [end.get(name) for name in END_COUNTS] if isinstance(end, dict) else []
-        if not counts or not all(type(count) is int and count >= 0 for count in counts):
+        if not counts or not all(map(_is_count, counts)):
             return False
         self.state.recorded, self.state.dropped, self.state.not_finite = counts
         self.state.is_cut = False
         return True
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value <= WHOLE_MAX
 
 
 def _whole_lines(file: BinaryIO, take: Callable[[bytes], None]) -> Iterator[bytes]:

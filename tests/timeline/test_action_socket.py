@@ -54,7 +54,7 @@ def answer_to(order, folder, in_force=(), begin=lambda _: "", declared=()):
     with socket.socket(socket.AF_UNIX) as visitor:
         visitor.settimeout(60.0)
         visitor.connect(str(folder / SOCKET_NAME))
-        visitor.sendall(orjson.dumps(order) + b"\n")
+        visitor.sendall((order if isinstance(order, bytes) else orjson.dumps(order)) + b"\n")
         loop.turn()  # it is let in
         loop.turn()  # and heard
         heard = b""
@@ -249,3 +249,21 @@ def test_an_order_is_held_to_the_bounds_to_which_a_timeline_holds_it(tmp_path, g
     answer = answer_to(order, tmp_path, declared=(kind,))
 
     assert answer["refusal"] == (f"turn.{refusal}" if refusal else "")
+
+
+DEEP = b"[" * 1000 + b"]" * 1000
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"action":"annotate","target":"run","parameters":{"text":"x"},"for_s":%s}' % DEEP,
+        b'{"action":"annotate","target":"run","parameters":{"text":%s}}' % DEEP,
+        b'{"action":%s,"target":"run"}' % DEEP,
+    ],
+)
+def test_an_order_that_is_nested_deeper_than_python_goes_is_refused(tmp_path, line):
+    assert answer_to(line, tmp_path)["refusal"]
+
+    order = {"action": "annotate", "target": "run", "parameters": {"text": "x"}}
+    assert answer_to(order, tmp_path) == {"refusal": ""}

@@ -449,7 +449,10 @@ def test_result_that_was_cut_off_is_none(tmp_path, content):
     summary = collect_run(made.run, processes=lambda: [])
 
     assert summary.exit_code == 1
-    assert summary.missing == ("host: no result",)
+    first, *named = summary.missing
+    assert first == "host: no result"
+    assert len(named) == (content != b'{"agents": {}}')
+    assert all(line.startswith("host/result.json: cannot be used: ") for line in named)
 
 
 def test_ticks_of_an_agent_that_left_nothing_are_missed_to_the_last(tmp_path):

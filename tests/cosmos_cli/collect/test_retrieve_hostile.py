@@ -9,6 +9,7 @@ from harness.split_run import LyingConnection, SplitRun, hashes, pieces
 
 from cosmos_cli.collect.machine_sources import RecordingMachines
 from cosmos_cli.collect.remote_manifest import check_offer
+from cosmos_cli.collect.retrieval_state import read_note, retrieved_files
 from cosmos_cli.fleet.failure import FailureKind
 from cosmos_cli.onboard.records import entry_line
 
@@ -279,3 +280,25 @@ def test_size_that_no_disk_holds_is_refused_before_anything_is_fetched(tmp_path)
 
     assert failure.kind is FailureKind.DISK_FULL
     assert fetched == []
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("wrong", [{"mtime_s": 2**70}, {"mtime_s": "\ud800"}, {"more": 2**70}])
+def test_a_value_that_no_file_of_ours_holds_keeps_no_record_from_coming(tmp_path, wrong):
+    split = SplitRun(tmp_path, machines=1)
+    change = listing(lambda files: [each.update(wrong) for each in files])
+
+    def lie(header, body):
+        """Take the release of what was never listed, too."""
+        if "error" in header:
+            header = {"ok": True, "value": {"released": True}}
+        return change(header, body)
+
+    outcome = split.retrieve({"pi01": LyingConnection(split.targets["pi01"], lie)})["pi01"]
+
+    assert outcome.is_ok, outcome.failure
+    assert outcome.value.is_released
+    assert read_note(split.run, "pi01").state == "released"
+    kept = dict(retrieved_files(split.run))
+    assert kept.keys() == split.there("pi01").keys()
+    assert all(entry.keys() - {"mtime_s"} == {"bytes", "sha256"} for entry in kept.values())

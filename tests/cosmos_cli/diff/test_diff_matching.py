@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ from cosmos_cli.diff.compare import differing_keys
 from cosmos_cli.diff.fields import FieldDifference
 from cosmos_cli.diff.stream import choose_pairing
 from madns_runtime.analysis.matching import Rows, match, pair_up
+from madns_runtime.recording.reader import read_columns
 from madns_runtime.recording.records import Field
 
 TICK = Field("tick", "", "int")
@@ -273,6 +275,25 @@ def test_texts_nested_too_deep_to_be_read_differ(kind):
     found.add(rows([0, 1], value=["[" * 5000, "["]), rows([0, 1], value=["[" * 5001, "["]))
 
     assert found.different == 1
+
+
+def test_values_of_streams_that_are_nested_deeper_than_python_goes_differ_and_are_not_shown(
+    tmp_path,
+):
+    sides = []
+    for name, inner in (("a", "1"), ("b", "2")):
+        path = tmp_path / name / "tree.jsonl"
+        path.parent.mkdir()
+        fields = [{"name": "value", "unit": "", "kind": "json"}]
+        header = {"schema": 1, "stream": "tree", "shape": "array", "fields": fields}
+        path.write_text(f"{json.dumps(header)}\n[{'[' * 1000}{inner}{']' * 1000}]\n")
+        sides.append(read_columns(path))
+    found = FieldDifference(Field("value", "", "json"))
+
+    found.add(*(Rows(keys=np.zeros(1), who=np.zeros(1), columns=columns) for columns in sides))
+
+    assert found.different == 1
+    assert found.values == ("nested too deep to be shown",) * 2
 
 
 def test_json_of_a_table_and_of_a_line_is_the_same():

@@ -108,3 +108,36 @@ def test_any_other_bytes_are_noise_of_bounded_length(line: bytes) -> None:
 )
 def test_json_that_is_no_event_is_noise(line: bytes) -> None:
     assert parse_event(line) == Noise(line.decode())
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"event":"log","level":"info","text":%s}',
+        b'{"event":"state","state":%s}',
+        b'{"event":"device","device":"x","status":"lost","why":%s}',
+        b'{"event":"exited","agent":"a","pid":7,"how":%s}',
+    ],
+)
+def test_an_event_that_is_nested_deeper_than_python_goes_is_noise(line: bytes) -> None:
+    event = parse_event(line % (b"[" * 1000 + b"]" * 1000))
+
+    assert isinstance(event, Noise)
+
+
+@pytest.mark.parametrize("number", ["1e20", "-1e20", "1e300", str(2**53 + 1)])
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"event":"started","agent":"a","pid":%s}',
+        '{"event":"started","agent":"a","pid":7,"incarnation":%s}',
+        '{"event":"exited","agent":"a","pid":%s,"code":1}',
+        '{"event":"listening","address":"x","port":%s}',
+        '{"event":"injected","order":%s}',
+        '{"event":"process","pid":%s}',
+        '{"event":"pong","n":%s}',
+        '{"event":"progress","ready":%s}',
+    ],
+)
+def test_an_event_with_a_number_that_cannot_be_told_again_is_noise(line: str, number: str) -> None:
+    assert parse_event((line % number).encode()) == Noise(line % number)

@@ -174,3 +174,21 @@ def test_an_order_and_its_answer_keep_their_number_beside_those_of_the_line(stag
     supervisor._inject(stream.commands[0])
 
     assert parse_event(said[0]) == FaultInserted(7, "")
+
+
+@pytest.mark.parametrize("number", [1e20, -1, 2**53 + 1])
+def test_a_number_that_cannot_be_told_back_is_none(stage: Stage, number: float) -> None:
+    stream, another = PipeStream(), PipeStream()
+    stage.line.open(stream)
+    stage.line.send({"command": "start"})
+    stream.say({"event": "pong", "n": 1, "number": number})
+    stage.turn()
+
+    stage.line.send({"command": "ping", "n": 2})
+    stage.line.attach(another, b"")
+    another.say({"event": "attached", "commands": number})
+    stage.turn()
+
+    assert len(stage.heard) == 1
+    assert stream.commands[-1] == {"command": "ping", "n": 2, "seen": 0}
+    assert another.commands == [{"command": "start", "number": 1}]
