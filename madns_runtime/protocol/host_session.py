@@ -61,6 +61,7 @@ class HostSession:
         self.await_returns = self._roster.await_returns
         self._running = self._roster.running
         self._links = HostLinks(self.peers, wire, self._events)
+        self.until_forged = self._links.until_forged
         self.seal_data = self._links.seal_data
         self.datagrams_to_send = self._links.datagrams_to_send
         self._timeouts = timeouts
