@@ -27,6 +27,7 @@ WORDS: Final[Mapping[str, str]] = {
     "sender": "another sender",
     "unknown_agent": "unknown agent",
     "old_incarnation": "an agent's earlier process",
+    "behind_forged": "in one packet behind one refused",
     "malformed": "malformed",
 }
 """Reasons, as people read them."""

@@ -3,8 +3,8 @@ Several datagrams of one sender in one packet of the network: what many agents o
 
     BUNDLE, then of each datagram its length (2 bytes, little-endian) and the datagram itself
 
-Each datagram keeps its own seal, so that one that was changed is refused, and counted, alone. A datagram by itself
-travels as it is; none begins with BUNDLE, which is no version.
+Each datagram keeps its own seal. What stands behind one with a wrong seal the host does not look at, but counts it: all are
+of one sender. A datagram by itself travels as it is; none begins with BUNDLE, which is no version.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """
 Bytes and messages: the first byte is the KIND, the rest a MessagePack list of the fields in order.
 
-Blocks of numbers travel as raw little-endian float64 in an extension type. Decoding is the one place
-where a peer's bytes become values: whatever they are, it returns a checked message or raises
-MalformedMessage, and allocates little beyond their length.
+Blocks of numbers travel as raw little-endian float64 in an extension type. One without a number carries
+a zero byte for each further innermost list that it is written out as: few bytes never become many.
+Decoding is the one place where a peer's bytes become values: whatever they are, it returns a checked
+message or raises MalformedMessage, and allocates little beyond their length.
 """
 
 from __future__ import annotations
@@ -221,7 +222,17 @@ def _encode_array(array: np.ndarray[Any, Any]) -> msgpack.ExtType:
         shape = _DIMENSIONS[array.ndim].pack(array.ndim, *array.shape)
     except StructError as error:
         raise UnencodableValue(f"the array's shape {array.shape} is too large") from error
-    return msgpack.ExtType(_ARRAY_EXT, shape + array.astype(_FLOAT64).tobytes())
+    numbers = array.astype(_FLOAT64).tobytes()
+    if not numbers:
+        numbers = bytes(_filling_bytes(array.shape, UnencodableValue))
+    return msgpack.ExtType(_ARRAY_EXT, shape + numbers)
+
+
+def _filling_bytes(shape: tuple[int, ...], fault: type[Exception]) -> int:
+    """Return the zero bytes behind the shape of an array without a number; raise *fault* if the shape is longer than a list."""
+    if math.prod(filter(None, shape)) > ITEMS_MAX:
+        raise fault(f"an array of shape {shape} holds no number and is longer than {ITEMS_MAX}")
+    return math.prod(shape[: shape.index(0)]) - 1
 
 
 def unpack(data: bytes) -> Any:
@@ -271,6 +282,7 @@ def _decode_ext(code: int, data: bytes) -> np.ndarray[Any, np.dtype[np.float64]]
     if len(data) < layout.size:
         raise ValueError("an array's shape is cut")
     shape = layout.unpack_from(data)[1:]
-    if math.prod(shape) * _FLOAT64.itemsize != len(data) - layout.size:
+    count = math.prod(shape)
+    if (count * _FLOAT64.itemsize or _filling_bytes(shape, ValueError)) != len(data) - layout.size:
         raise ValueError(f"an array of shape {shape} has {len(data) - layout.size} bytes")
-    return np.frombuffer(data, _FLOAT64, offset=layout.size).reshape(shape)
+    return np.frombuffer(data, _FLOAT64, count, layout.size).reshape(shape)

@@ -180,6 +180,16 @@ class Seal:
         self.send_mac = blake2b(digest_size=MAC_BYTES, key=send_key)
         self.receive_mac = blake2b(digest_size=MAC_BYTES, key=receive_key)
 
+    @classmethod
+    def derive(
+        cls, run_key: bytes, session: bytes, agent_index: int, incarnation_id: int, role: Role
+    ) -> Seal:
+        """Return the end of *role* in a conversation; see `derive_keys` for the other arguments."""
+        keys = derive_keys(run_key, session, agent_index, incarnation_id)
+        return cls(
+            keys, role, session=session, agent_index=agent_index, incarnation_id=incarnation_id
+        )
+
     def close(self, rest: bytes, payload: bytes) -> bytes:
         """Return the datagram of a packed header rest (see REST) and the frames behind it."""
         body = self.prefix + rest + payload

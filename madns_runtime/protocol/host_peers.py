@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from madns_runtime.config import Timeouts
 from madns_runtime.protocol.codec import encode_data, encode_message
 from madns_runtime.protocol.counters import REFUSALS
-from madns_runtime.protocol.datagram import DATAGRAM_BYTES_MAX, Header
+from madns_runtime.protocol.datagram import DATAGRAM_BYTES_MAX, Header, Role, Seal
 from madns_runtime.protocol.events import (
     AgentLost,
     AgentMoved,
@@ -32,8 +32,11 @@ from madns_runtime.protocol.states import HOST_LIVE, HostState
 Address = tuple[Any, ...]
 
 PINGS_MAX = 16
-STRANGERS: Final = ("session", "unknown_agent", "old_incarnation")
-"""Why a datagram is of no link, beside what links refuse: it is of another run, of nobody, of an earlier process."""
+STRANGERS: Final = ("session", "unknown_agent", "old_incarnation", "behind_forged")
+"""
+Why a datagram is of no link, beside what links refuse: it is of another run, of nobody, of an earlier process, or came
+in one packet behind one that was forged.
+"""
 INCARNATIONS_MAX = 128
 """Starts of one agent in one run; more are refused."""
 
@@ -210,6 +213,7 @@ class HostLinks:
         self._timers: list[tuple[float, int]] = []
         self.refused = dict.fromkeys((*REFUSALS, *STRANGERS), 0)
         """Datagrams that are of no link, by reason; each link counts its own."""
+        self._behind: Iterator[bytes] = iter(())
 
     def mark(self, peer: Peer) -> None:
         """Note that a link was used: it may have something to send, or another timer."""
@@ -255,6 +259,16 @@ class HostLinks:
         datagram = link.seal_best(encode_data(payload), now_s, channel=PLUGIN_CHANNEL)
         return None if datagram is None else (datagram, address)
 
+    def until_forged(self, datagrams: Iterable[bytes]) -> Iterator[bytes]:
+        """
+        Return the datagrams of one packet, to be handed in one by one: behind a forged one there are no more.
+
+        All are of one process, so that nothing is lost; a packet of forgeries would cost as much as many. Those that
+        are left out are counted.
+        """
+        self._behind = iter(datagrams)
+        return self._behind
+
     def receive(self, data: bytes, address: Address, now_s: float) -> tuple[Peer, Link] | None:
         """
         Take a datagram from anywhere.
@@ -266,13 +280,15 @@ class HostLinks:
         header = Header.peek(data)
         fault = self._find_fault(header, len(data))
         if header is None or fault is not None:
-            self.refused[fault or "short"] += 1
+            self._refuse_forged(fault or "short")
             return None
         peer = self._by_index[header.agent_index]
         link = peer.link
         if link is None or header.incarnation_id != link.incarnation_id:
             link = self._receive_stranger(peer, header, data, now_s)
         elif not link.receive_datagram(data, now_s):
+            if link.find_fault(data) is not None:
+                self._drop_behind()
             return None
         if link is None:
             return None
@@ -280,6 +296,13 @@ class HostLinks:
         peer.address = address
         self._dirty.add(peer.index)
         return peer, link
+
+    def _refuse_forged(self, reason: str) -> None:
+        self.refused[reason] += 1
+        self._drop_behind()
+
+    def _drop_behind(self) -> None:
+        self.refused["behind_forged"] += sum(1 for _ in self._behind)
 
     def _find_fault(self, header: Header | None, size: int) -> str | None:
         """Return why a datagram can be of no link, None if it can."""
@@ -301,9 +324,12 @@ class HostLinks:
             self.refused["old_incarnation"] += 1
             return None
         wire = self._wire
-        link = Link.for_host(
-            wire.run_key, wire.session, peer.index, header.incarnation_id, limits=wire.limits
-        )
+        seal = Seal.derive(wire.run_key, wire.session, peer.index, header.incarnation_id, Role.HOST)
+        if (fault := seal.find_fault(data)) is not None:
+            self._refuse_forged(fault)
+            return None
+        # Only for one who has the key: a link takes several times as long to make as a seal.
+        link = Link(seal=seal, limits=wire.limits)
         if not link.receive_datagram(data, now_s):
             for reason, count in link.counters.refused.items():
                 self.refused[reason] += count

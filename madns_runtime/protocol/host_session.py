@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from madns_runtime import __version__
 from madns_runtime.config import Timeouts
-from madns_runtime.protocol import events, messages
+from madns_runtime.protocol import accounts, events, messages
 from madns_runtime.protocol.codec import NO_DATA, MalformedMessage, decode_data, decode_message
 from madns_runtime.protocol.datagram import PREFIX_BYTES
 from madns_runtime.protocol.events import HostSessionEvent, Phase
@@ -61,6 +61,7 @@ class HostSession:
         self.await_returns = self._roster.await_returns
         self._running = self._roster.running
         self._links = HostLinks(self.peers, wire, self._events)
+        self.until_forged = self._links.until_forged
         self.seal_data = self._links.seal_data
         self.datagrams_to_send = self._links.datagrams_to_send
         self._timeouts = timeouts
@@ -262,7 +263,7 @@ class HostSession:
                 # It ends itself: that loses one member, and under abort the run.
                 if peer.phase not in (Phase.LOST, Phase.STOPPED):
                     self._lose({peer.name: reason}, now_s)
-            case messages.AgentStopped(records):
+            case messages.AgentStopped(records) if accounts.are_last_counts(records):
                 self._agent_stopped(peer, records, now_s)
             case messages.Hello() if peer.pid is None:
                 self._welcome(peer, message, now_s)
@@ -274,18 +275,22 @@ class HostSession:
                 t_s
             ):
                 self._events.append(events.AgentDataReceived(peer.name, message))
-            case messages.Ping(t_agent_s, report):
+            case messages.Ping(t_agent_s, report) if not report or accounts.is_report(report):
                 peer.report = report or peer.report
                 peer.pings.append((t_agent_s, now_s))
                 self._links.mark(peer)
             case messages.SimulationReady() if peer.phase is Phase.SETTING_UP:
                 self._agent_simulation_ready(peer, now_s)
-            case messages.SimulationComplete(summary) if peer.phase is Phase.RUNNING:
+            case messages.SimulationComplete(summary) if (
+                peer.phase is Phase.RUNNING and accounts.is_summary(summary)
+            ):
                 peer.summary = summary
                 self._roster.move(peer, Phase.COMPLETE)
                 self._progress(now_s)
             case _:
-                self.malformed_count += 1  # a message that only hosts send, or out of turn
+                self.malformed_count += (
+                    1  # a message that only hosts send, out of turn, or without its shape
+                )
 
     def _welcome(self, peer: Peer, hello: messages.Hello, now_s: float) -> None:
         peer.pid = hello.pid

@@ -25,7 +25,6 @@ from madns_runtime.protocol.datagram import (
     STREAMS,
     Role,
     Seal,
-    derive_keys,
 )
 from madns_runtime.protocol.incoming import Incoming
 from madns_runtime.protocol.link_settings import PLUGIN_CHANNEL, LinkLimits
@@ -42,7 +41,7 @@ class Link:
     One peer's conversation.
 
     What one half of it does alone is that half's method, handed out without a call between: see
-    `Incoming` for `open_best` and `next_message`, `Outgoing` for the others.
+    `Seal` for `find_fault`, `Incoming` for `open_best` and `next_message`, `Outgoing` for the others.
     """
 
     __slots__ = (
@@ -52,6 +51,7 @@ class Link:
         "_packets",
         "_seal",
         "datagrams_to_send",
+        "find_fault",
         "get_timer",
         "handle_timer",
         "incarnation_id",
@@ -74,6 +74,7 @@ class Link:
         self._outgoing = outgoing = Outgoing(
             seal, limits, counters=counters, packets=packets, incoming=incoming
         )
+        self.find_fault = seal.find_fault
         self.open_best = incoming.open_best
         self.next_message = incoming.next_message
         self.seal_best = outgoing.seal_best
@@ -94,7 +95,8 @@ class Link:
     ) -> Link:
         """Return the agent's end of a conversation; see `datagram.derive_keys` for the arguments."""
         return cls(
-            seal=_seal(run_key, session, agent_index, incarnation_id, Role.AGENT), limits=limits
+            seal=Seal.derive(run_key, session, agent_index, incarnation_id, Role.AGENT),
+            limits=limits,
         )
 
     @classmethod
@@ -109,7 +111,8 @@ class Link:
     ) -> Link:
         """Return the host's end of a conversation; see `datagram.derive_keys` for the arguments."""
         return cls(
-            seal=_seal(run_key, session, agent_index, incarnation_id, Role.HOST), limits=limits
+            seal=Seal.derive(run_key, session, agent_index, incarnation_id, Role.HOST),
+            limits=limits,
         )
 
     # What the owner asks.
@@ -265,10 +268,3 @@ class Link:
             self._outgoing.streams[service - 1].abandon()
             if service == _SYNC:
                 self._outgoing.watch.give_up()
-
-
-def _seal(
-    run_key: bytes, session: bytes, agent_index: int, incarnation_id: int, role: Role
-) -> Seal:
-    keys = derive_keys(run_key, session, agent_index, incarnation_id)
-    return Seal(keys, role, session=session, agent_index=agent_index, incarnation_id=incarnation_id)

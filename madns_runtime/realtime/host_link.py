@@ -107,7 +107,7 @@ class HostPort:
             return
         self._kept_for = address
         try:
-            for datagram in datagrams:
+            for datagram in self.session.until_forged(datagrams):
                 take(datagram, address)
         finally:
             kept, self._kept, self._kept_for = self._kept, [], None
@@ -116,10 +116,16 @@ class HostPort:
                     self.socket.send(bundle, address)
 
     def waiting(self) -> Iterator[tuple[bytes, Address]]:
-        """Yield the datagrams that wait in the socket, of a bounded number of packets."""
+        """
+        Yield the datagrams that wait in the socket, of a bounded number of packets.
+
+        The session must have taken each before the next is asked for.
+        """
         for packet, address in self.socket.receive_all():
             datagrams = split(packet) if is_bundle(packet) else None
-            for datagram in (packet,) if datagrams is None else datagrams:
+            for datagram in (
+                (packet,) if datagrams is None else self.session.until_forged(datagrams)
+            ):
                 yield datagram, address
 
     def _post(self, data: bytes, address: Address) -> None:

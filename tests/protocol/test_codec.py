@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import random
+import struct
 import tracemalloc
 from collections import OrderedDict
 from types import MappingProxyType
@@ -259,6 +261,30 @@ def _ext(data, code=1):
 def test_hostile_value_is_malformed(data):
     with pytest.raises(MalformedMessage):
         unpack(data)
+
+
+@pytest.mark.parametrize("shape", [(2**32 - 1, 0), (10**6, 1, 0), (0, 200, 200)], ids=str)
+def test_an_array_of_nothing_is_no_longer_than_a_list(shape):
+    data = _ext(struct.pack(f"<B{len(shape)}I", len(shape), *shape))
+
+    with pytest.raises(MalformedMessage, match="holds no number"):
+        unpack(data)
+    with pytest.raises(UnencodableValue, match="holds no number"):
+        pack(np.empty(shape))
+
+
+@pytest.mark.parametrize("shape", [(0,), (0, 3), (0, 16_384), (16_384, 0), (2, 3, 0, 4)], ids=str)
+def test_an_array_of_nothing_keeps_its_shape_and_what_it_is_written_out_as_costs_bytes(shape):
+    data = pack(np.empty(shape))
+
+    value = unpack(data)
+    assert (value.shape, value.dtype) == (shape, np.float64)
+    assert len(json.dumps(value.tolist())) <= 6 * len(data)
+
+
+def test_many_lists_in_a_short_array_of_nothing_are_malformed():
+    with pytest.raises(MalformedMessage, match="has 0 bytes"):
+        unpack(_ext(struct.pack("<B2I", 2, 1000, 0)))
 
 
 def test_a_point_in_time_is_no_type_of_its_own():

@@ -8,11 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from madns_runtime.config import Agents, HostLaunch, Network, RunConfig, TimeSettings
+from madns_runtime.config import Agents, HostLaunch, Network, RunConfig, Timeouts, TimeSettings
 from madns_runtime.errors import PluginError
 from madns_runtime.protocol.bundle import BUNDLE, bundle_up, split
-from madns_runtime.protocol.datagram import OVERHEAD_BYTES
-from madns_runtime.protocol.messages import Service
+from madns_runtime.protocol.datagram import OVERHEAD_BYTES, PREFIX, Role
+from madns_runtime.protocol.host_session import HostSession
+from madns_runtime.protocol.link import Link
+from madns_runtime.protocol.link_settings import LinkSettings
+from madns_runtime.protocol.messages import VERSION, Service
 from madns_runtime.reactor.udp import UdpSocket
 from madns_runtime.realtime.host_link import HostPort
 
@@ -23,6 +26,7 @@ def port():
     port = HostPort.__new__(HostPort)
     port.socket = UdpSocket.bind("127.0.0.1", 0, receive_buffer_bytes=262_144)
     port._kept_for, port._kept = None, []
+    port.session = SimpleNamespace(until_forged=iter)
     yield port
     port.socket.close()
 
@@ -101,6 +105,89 @@ def test_a_malformed_bundle_is_handed_on_to_be_refused(port, agents):
     assert [data for data, _ in port.waiting()] == [bytes([BUNDLE, 1, 2])]
     port.read(lambda data, address: got.append(data))
     assert len(got) == 1
+
+
+SESSION, RUN_KEY = bytes(8), bytes(range(32))
+
+
+def forged(incarnation_id, *, session=SESSION):
+    """Return a datagram that claims to be of the first agent's, without the run's key."""
+    prefix = PREFIX.pack(VERSION, Role.AGENT, 1, incarnation_id, session)
+    return prefix + bytes(OVERHEAD_BYTES - len(prefix))
+
+
+def checked_by(session, port, way):
+    """Return which datagrams of what waits in the socket a session was given."""
+    given = []
+
+    def take(data, address):
+        given.append(data)
+        session.receive_data(data, address, 1.0)
+
+    port.session = session
+    if way == "read":
+        port.read(take)
+    else:
+        for data, address in port.waiting():
+            take(data, address)
+    return given
+
+
+@pytest.fixture
+def session():
+    wire = LinkSettings(run_key=RUN_KEY, session=SESSION)
+    names = ("agent-01", "agent-02")
+    return HostSession(names, wire, timeouts=Timeouts(), on_agent_loss="abort", now_s=0.0)
+
+
+@pytest.mark.parametrize("way", ["read", "waiting"])
+@pytest.mark.parametrize("reason", ["mac", "session", "known"])
+def test_behind_a_forged_datagram_the_rest_of_a_packet_is_not_looked_at(
+    port, agents, session, way, reason
+):
+    if reason == "known":
+        link = Link.for_agent(RUN_KEY, SESSION, 1, 0)
+        link.send_urgent(b"\xff", Service.BEST, 0.5)
+        (first,) = link.datagrams_to_send(0.5)
+        session.receive_data(first, ("127.0.0.1", 1), 0.5)
+    run = bytes([7] * 8) if reason == "session" else SESSION
+    ids = [0] * 16 if reason == "known" else range(16)
+    (bundle,) = bundle_up([forged(number, session=run) for number in ids])
+    agents.send(bundle)
+
+    given = checked_by(session, port, way)
+
+    assert len(given) == 1
+    assert session.refused["behind_forged"] == 15
+    assert session.refused["mac"] == (reason == "mac")
+
+
+@pytest.mark.parametrize("way", ["read", "waiting"])
+def test_what_came_twice_or_of_an_earlier_process_holds_up_nothing_behind_it(
+    port, agents, session, way
+):
+    links = [Link.for_agent(RUN_KEY, SESSION, index, index) for index in (1, 2)]
+    for link in links:
+        link.send_urgent(b"\xff", Service.BEST, 0.5)
+    first, second = (link.datagrams_to_send(0.5)[0] for link in links)
+    session.receive_data(first, ("127.0.0.1", 1), 0.5)
+    session.peers["agent-01"].incarnation_ids_seen.add(9)
+    (bundle,) = bundle_up([first, forged(9), second])
+    agents.send(bundle)
+
+    assert checked_by(session, port, way) == [first, forged(9), second]
+    assert session.peers["agent-02"].link is not None
+    assert session.refused["behind_forged"] == 0
+
+
+def test_no_link_is_made_for_one_who_does_not_have_the_key(session, monkeypatch):
+    made = []
+    monkeypatch.setattr(Link, "__init__", lambda self, **given: made.append(given))
+
+    session.receive_data(forged(5), ("127.0.0.1", 1), 1.0)
+
+    assert made == []
+    assert session.refused["mac"] == 1
 
 
 @pytest.mark.parametrize(
