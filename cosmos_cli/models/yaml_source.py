@@ -91,12 +91,16 @@ class YamlSource:
     @classmethod
     def of(cls, label: str, text: str) -> YamlSource:
         """Make a source; the lines are what carets stand under."""
-        return cls(label, text, tuple(re.split(r"\r\n|\r|\n", text)))
+        return cls(label, text, _lines(text))
 
     def fault(self, text: str, *, line: int, column: int, path: str = "") -> Fault:
         """Return a fault at a place of this source."""
         source = self.lines[line - 1] if 0 < line <= len(self.lines) else ""
         return Fault(text=text, path=path, file=self.label, line=line, column=column, source=source)
+
+
+def _lines(text: str) -> tuple[str, ...]:
+    return tuple(re.split(r"\r\n|\r|\n", text))
 
 
 def read_source(path: Path) -> YamlSource:
@@ -156,8 +160,8 @@ def compose(source: YamlSource, *, has_64_bits: bool = True) -> Node | None:
     """
     bad = _UNPRINTABLE.search(source.text)
     if bad:
-        line = source.text.count("\n", 0, bad.start()) + 1
-        column = bad.start() - (source.text.rfind("\n", 0, bad.start()) + 1) + 1
+        before = _lines(source.text[: bad.start()])
+        line, column = len(before), len(before[-1]) + 1
         text = f"expected text, got the control character U+{ord(bad.group()):04X}"
         raise InputError(faults=[source.fault(text, line=line, column=column)])
     try:
@@ -321,4 +325,8 @@ def _syntax_fault(source: YamlSource, error: yaml.MarkedYAMLError) -> Fault:
     place, text = plain_words(source.lines, error, depth_max=DEPTH_MAX)
     if place is None:
         return Fault(text=text, file=source.label)
-    return source.fault(text, line=place[0], column=place[1])
+    end = (len(source.lines), len(source.lines[-1]) + 1)
+    line, column = min(
+        place, end
+    )  # the parser's end of a text without a last newline is a line more
+    return source.fault(text, line=line, column=column)

@@ -1,5 +1,6 @@
 """Element sets: the four syntaxes agree, and a bad file is named with its line."""
 
+import re
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -298,8 +299,18 @@ def test_julian_dates_are_those_of_the_almanac():
 
 
 def test_sources_are_named_for_every_data_file():
-    sources = (DATA / "SOURCES.md").read_text()
+    text = (DATA / "SOURCES.md").read_text()
+    listed = re.findall(r"^\| ([^ |][^|]*\.\w+) \|", text, flags=re.M)
+    named = {name for cell in listed for name in _files_of(cell)}
+    there = {path.name for path in Path(DATA).iterdir() if path.is_file()}
 
-    for path in Path(DATA).iterdir():
-        if path.name != "SOURCES.md":
-            assert path.name in sources or path.suffix in sources
+    assert named == there - {"SOURCES.md", "make_ring.py"}
+    assert "`python scenarios/data/make_ring.py`" in text
+
+
+def _files_of(cell):
+    """Return the names in "a.csv, .json, b.tle"; what is an ending alone is of the file before it."""
+    stem = ""
+    for name in cell.split(", "):
+        stem = stem if name.startswith(".") else Path(name).stem
+        yield f"{stem}{Path(f'x{name}').suffix}"

@@ -29,16 +29,21 @@ def spans(text):
 
 def commands(text):
     """Return every `cosmos ...` that a text names, as words, without what a comment says."""
+    return _lines_like(text, r"cosmos [a-z]+\b(?!:)")
+
+
+def benchmark_commands(text):
+    """Return every `python benchmarks/...` that a text names, in the same way."""
+    return _lines_like(text, r"python benchmarks/\w+\.py\b")
+
+
+def _lines_like(text, pattern):
     text = re.sub(r"\\\n\s*", "", text)
     lines = [line for block in blocks(text, "sh") for line in block.splitlines()]
     lines += [line[4:] for line in _FENCE.sub("", text).splitlines() if line.startswith("    ")]
     lines += spans(text)
     found = [re.sub(r"^\.venv/bin/", "", line.strip()) for line in lines]
-    return [
-        shlex.split(line, comments=True)
-        for line in found
-        if re.match(r"cosmos [a-z]+\b(?!:)", line)
-    ]
+    return [shlex.split(line, comments=True) for line in found if re.match(pattern, line)]
 
 
 def row_keys(text, heading):

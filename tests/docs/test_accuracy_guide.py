@@ -18,6 +18,10 @@ from madns_runtime.simulations.constellation.truth.propagation import (
 )
 
 GUIDE = (ROOT / "docs/accuracy.md").read_text("utf-8")
+NOT_INSTALLED = {name for name in ("numba",) if importlib.util.find_spec(name) is None}
+"""Propagators that the benchmark leaves out here."""
+ROUNDING = {("Between knots", "0.1")}
+"""Rows that are the machine's own rounding: a nanometre is one bit of a coordinate."""
 
 
 @pytest.fixture(scope="module")
@@ -64,12 +68,15 @@ def test_the_guide_names_the_command_and_holds_every_table(load):
 )
 def test_printed_figures_are_those_of_the_guide(load, title):
     (section,) = (each for each in load("accuracy").SECTIONS if each.title == title)
-    expected = {row[0]: row[1:] for row in table_under(title)}
+    expected = {row[0]: row[1:] for row in table_under(title) if row[0] not in NOT_INSTALLED}
 
-    for name, *found in section.rows():
-        for got, said in zip(found, expected[name], strict=True):
-            # Digits are the machine's, powers of ten are not.
-            assert abs(math.log10(float(got) / float(said))) < 0.8
+    found = {name: figures for name, *figures in section.rows()}
+
+    assert list(found) == list(expected)
+    for name, figures in found.items():
+        decades_max = 0.8 if (title, name) in ROUNDING else 0.35  # one printed digit may be another
+        for got, said in zip(figures, expected[name], strict=True):
+            assert abs(math.log10(float(got) / float(said))) < decades_max, (name, got, said)
 
 
 def test_the_guide_lists_every_propagator():

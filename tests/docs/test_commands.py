@@ -1,9 +1,10 @@
-"""Every command, option and variable of the environment that the guides name exists."""
+"""Every command, option and variable of the environment that the guides name exists, and every benchmark's."""
 
+import ast
 import re
 
 import pytest
-from guides import GUIDES, ROOT, commands, spans
+from guides import GUIDES, ROOT, benchmark_commands, commands, spans
 from tower.faults import FAULTS
 
 from cosmos_cli.commands.command_group import COMMANDS, each_command
@@ -73,6 +74,46 @@ def test_readme_table_has_every_command():
     table = readme.split("\n## Commands\n", 1)[1].split("\n## ", 1)[0]
 
     assert {verb for verb in COMMANDS if f"cosmos {verb}" not in table} == set()
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.name)
+def test_every_option_of_a_benchmark_that_a_guide_gives_exists(guide):
+    named = benchmark_commands(guide.read_text("utf-8"))
+
+    assert {" ".join(words): wrong for words in named if (wrong := wrong_options(words))} == {}
+
+
+def wrong_options(words):
+    """Return what a command gives a benchmark that its parser does not know."""
+    script, given = ROOT / words[1], words[2:]
+    if not script.is_file():
+        return [words[1]]
+    known = {
+        argument.value
+        for call in ast.walk(ast.parse(script.read_text("utf-8")))
+        if isinstance(call, ast.Call) and getattr(call.func, "attr", "") == "add_argument"
+        for argument in call.args
+        if isinstance(argument, ast.Constant)
+    }
+    return [word for word in given if word.startswith("-") and word.split("=")[0] not in known]
+
+
+def test_what_a_benchmark_does_not_know_is_found():
+    text = (
+        "`python benchmarks/star.py --pair 2` or `python\nbenchmarks/star.py --pairs=2`\n\n"
+        "    python benchmarks/stra.py  # --all\n"
+    )
+
+    found = [wrong_options(words) for words in benchmark_commands(text)]
+    assert found == [["benchmarks/stra.py"], ["--pair"], []]
+
+
+def test_benchmarks_of_guides_are_read_as_they_are_written():
+    texts = [path.read_text("utf-8") for path in GUIDES]
+    named = [words for text in texts for words in benchmark_commands(text)]
+    mentioned = sum(len(re.findall(r"python\s+benchmarks/", text)) for text in texts)
+
+    assert len(named) == mentioned > 20
 
 
 def test_every_variable_of_the_environment_exists():

@@ -1,12 +1,13 @@
 """What the README tells a person to do, done."""
 
+import ast
 import re
 import subprocess
 from pathlib import Path
 
 import pytest
 import yaml
-from guides import run
+from guides import blocks, run
 from harness.cosmos_command import LOOSE
 
 from cosmos_cli import app
@@ -49,6 +50,24 @@ def test_readme_shows_the_scenario_as_it_is():
     assert shown is not None
     actual = yaml.safe_load((ROOT / "scenarios" / "iridium10.yaml").read_text("utf-8"))
     assert yaml.safe_load(shown.group(1)) == actual
+
+
+def test_readme_shows_the_rovers_step_as_the_tutorial_makes_it(tmp_path):
+    (shown,) = blocks(README, "python")
+    assert run(TESTED[0].splitlines()[0], tmp_path).returncode == 0
+    program = (tmp_path / "rover" / "rover.py").read_text("utf-8")
+
+    methods = [
+        inner
+        for outer in ast.walk(ast.parse(program))
+        if isinstance(outer, ast.ClassDef)
+        for inner in outer.body
+        if isinstance(inner, ast.FunctionDef) and inner.name == "step"
+    ]
+
+    assert ast.unparse(ast.parse(shown)) in map(ast.unparse, methods)
+    comments = re.findall(r"#.*", shown)
+    assert [comment for comment in comments if comment not in program] == []
 
 
 def test_every_command_that_the_readme_names_exists(tmp_path):

@@ -53,7 +53,9 @@ def test_ctrl_c_shuts_down_cleanly_and_collects(laboratory, interrupt):
     assert document["reason"] == "interrupted by the operator"
     assert document["data"]["missing"] == []
     assert document["problems"] == []
-    for path in run.directory.glob("agents/*/*.jsonl"):
+    paths = sorted(run.directory.glob("agents/*/*.jsonl"))
+    assert {path.parent.name for path in paths} == {"agent-01", "agent-02", "agent-03"}
+    for path in paths:
         assert not read_stream(path).state.is_cut, path
     assert laboratory.leftovers() == []
 

@@ -203,7 +203,9 @@ def test_workers_end_with_a_killed_host_and_keep_their_records(start_host):
     run.process.wait()
 
     wait_until(lambda: not any(map(is_alive, workers)), "workers live on")
-    for path in run.folder.glob("agents/*/own.jsonl"):
+    paths = sorted(run.folder.glob("agents/*/own.jsonl"))
+    assert [path.parent.name for path in paths] == [f"agent-{n:02}" for n in range(1, 7)]
+    for path in paths:
         assert path.read_text().splitlines()[-1].startswith('{"end"')
 
 

@@ -240,7 +240,9 @@ def test_emulator_that_is_killed_or_frozen_is_named_and_started_anew(cosmos, num
     assert len(harmed) == 1
     why = (folder / "devices" / harmed[0] / "events.jsonl").read_text()
     assert "the emulator is gone" in why or "answers nothing for 2 s" in why
-    assert document["timing"]["missed"] == 0 or document["timing"]["ticks"] == 4000
+    # Ten agents' 10 Hz for 40 s are due, whatever a device does; a busy machine may miss some.
+    assert document["timing"]["ticks"] == 4000
+    assert document["timing"]["missed"] < 400
     agent = harmed[0].partition("/")[0]
     assert document["simulation"]["agents"][agent]["flight"]["answers"] > 200
     assert rates_deg_s(folder, agent)[-1] < 8.0

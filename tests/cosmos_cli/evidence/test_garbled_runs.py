@@ -83,6 +83,26 @@ def garbled(document, at, wrong):
     return document
 
 
+def look_for_unfinished(_run):
+    unfinished_runs()
+
+
+def list_runs(_run):
+    assert app.run(["runs", "--json"]) == 0
+
+
+def report(_run):
+    assert app.run(["report", "1"]) in (0, 2)
+
+
+def draw(run):
+    build_sections(run, run.read_json(run.run_json) or {})
+
+
+def collect(run):
+    collect_run(run, processes=lambda: [])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [12, pytest.param(120, marks=pytest.mark.nightly)])
 def test_wrong_types_anywhere_end_in_no_traceback(made, monkeypatch, capsys, count):
@@ -91,23 +111,24 @@ def test_wrong_types_anywhere_end_in_no_traceback(made, monkeypatch, capsys, cou
     cases = [(name, at) for name in NAMES for at in places(documents[name])]
     random_ = random.Random(count)
 
+    uses = (look_for_unfinished, list_runs, report, draw, collect)
+    done = dict.fromkeys([use.__name__ for use in uses], 0)
     drawn = [(name, at, random_.choice(WRONG)) for name, at in random_.sample(cases, count)]
     for name, at, wrong in [*FOUND, *drawn]:
         for each in NAMES:
             (made.run.path / each).write_text(json.dumps(documents[each]))
         (made.run.path / name).write_text(json.dumps(garbled(documents[name], at, wrong)))
-        try:
-            unfinished_runs()
-            assert app.run(["runs", "--json"]) == 0, (name, at, wrong)
-            assert app.run(["report", "1"]) in (0, 2), (name, at, wrong)
-            build_sections(made.run, made.run.read_json(made.run.run_json) or {})
-            collect_run(made.run, processes=lambda: [])
-        except CosmosError:
-            continue
-        except Exception as error:
-            raise AssertionError((name, at, wrong)) from error
-        finally:
-            assert "defect" not in capsys.readouterr().err, (name, at, wrong)
+        for use in uses:
+            try:
+                use(made.run)
+                done[use.__name__] += 1
+            except CosmosError:
+                pass
+            except Exception as error:
+                raise AssertionError((use.__name__, name, at, wrong)) from error
+        assert "defect" not in capsys.readouterr().err, (name, at, wrong)
+    # Refusals are right where a file is none; a defect that always looks like one is not.
+    assert min(done.values()) >= 0.75 * (len(FOUND) + count), done
 
 
 @pytest.mark.parametrize(

@@ -214,12 +214,26 @@ def test_separators_are_read_beside_what_stands_for_them():
     assert read_document(YamlSource.of("f", text)).value == {"a": text[3:-1]}
 
 
-@given(st.text(max_size=200))
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [("[", (1, 2)), ("[\n", (2, 1)), ("a: 1\rb: \x07", (2, 4)), ("a\r\n\x07", (2, 1))],
+)
+def test_places_lie_within_the_text(text, place):
+    fault = fault_of(text)
+
+    assert (fault.line, fault.column) == place
+
+
+@given(st.text(max_size=200) | st.text("[]{}:,-?&*!|>'\"%@#a \t\n\r\x07", max_size=30))
 def test_any_text_is_read_or_refused_with_a_place(text):
+    source = YamlSource.of("a.yaml", text)
     try:
-        compose(YamlSource.of("a.yaml", text))
+        compose(source)
     except InputError as error:
-        assert all(fault.file == "a.yaml" for fault in error.faults)
+        (fault,) = error.faults
+        line = source.lines[fault.line - 1]
+        assert (fault.file, fault.source) == ("a.yaml", line)
+        assert 1 <= fault.column <= len(line) + 1
 
 
 def whole_fault(path):

@@ -21,6 +21,7 @@ from provision_machines import machine_of
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.models.machine_facts import MachineFacts
 from cosmos_cli.provision import HELPER_PARTS
 from cosmos_cli.provision.sent_wheels import sent_wheel
 from cosmos_cli.provision.trees import TreeFile, tree_of
@@ -35,6 +36,7 @@ SETTINGS = {
     "cosmos_wifi": False,
     "cosmos_bluetooth": False,
 }
+WITHOUT_SUDO = {"ansible_become": False, "cosmos_receive_buffer_bytes": 8388608}
 
 
 @pytest.fixture
@@ -424,18 +426,29 @@ def test_wifi_that_may_carry_the_connection_stays(place):
     assert not (place / "cosmos").exists()
 
 
-def test_machine_that_may_not_become_root_is_refused_before_anything_is_done(place):
-    """But who logs in as root needs no sudo."""
+def test_machine_that_may_not_become_root_is_refused_before_anything_is_done(place, monkeypatch):
+    read = MachineFacts.from_mapping
+    monkeypatch.setattr(
+        MachineFacts, "from_mapping", lambda told, **at: read({**told, "uid": 1000}, **at)
+    )
     kit = FakeKit(make_system(place / "system"))
-    variables = {"ansible_become": False, "cosmos_receive_buffer_bytes": 8388608}
+    machine = machine_at(place, variables=WITHOUT_SUDO)
 
-    brought = up(connection_to(place / "cosmos"), machine_at(place, variables=variables), kit)
+    brought = up(connection_to(place / "cosmos"), machine, kit)
 
-    if os.geteuid() == 0:
-        assert brought.failure is None
-        return
     assert brought.failure.kind is FailureKind.NO_SUDO
     assert not (place / "cosmos").exists()
+
+
+@needs_root
+def test_who_logs_in_as_root_needs_no_sudo(place):
+    kit = FakeKit(make_system(place / "system"))
+    machine = machine_at(place, variables=WITHOUT_SUDO)
+
+    brought = up(connection_to(place / "cosmos"), machine, kit)
+
+    assert brought.failure is None
+    assert (place / "cosmos").exists()
 
 
 def test_missing_interpreter_is_told_however_soon_its_shell_ends(place):

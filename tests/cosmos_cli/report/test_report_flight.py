@@ -241,7 +241,15 @@ def test_error_of_a_sensor_is_against_truth_at_the_time_it_was_valid(blocks):
 
 
 def test_what_the_host_tells_better_is_not_drawn_twice(blocks):
-    assert not any("commands" in title.lower() for title in blocks)
+    """Nor as lines of `commands`, whose title would be the field's name."""
+    assert sorted(blocks["Control"]) == [
+        "Delta-v spent",
+        "Estimate: sma",
+        "Maneuvers by agent",
+        "Slack of the synchronous inequality",
+        "Slot error believed, by agent",
+        "Slot error believed, of all agents",
+    ]
 
 
 @pytest.mark.browser
