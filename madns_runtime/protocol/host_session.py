@@ -288,9 +288,8 @@ class HostSession:
                 self._roster.move(peer, Phase.COMPLETE)
                 self._progress(now_s)
             case _:
-                self.malformed_count += (
-                    1  # a message that only hosts send, out of turn, or without its shape
-                )
+                # A message that only hosts send, out of turn, or without its shape.
+                self.malformed_count += 1
 
     def _welcome(self, peer: Peer, hello: messages.Hello, now_s: float) -> None:
         peer.pid = hello.pid
