@@ -3,6 +3,7 @@
 import pytest
 from harness.cosmos_command import LOOSE, CosmosCommand
 
+from cosmos_cli import app
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.loading import load_scenario
 from madns_runtime.recording.reader import read_stream
@@ -74,13 +75,16 @@ def test_what_does_not_fit_is_found_before_a_run(scenario, change, words):
     assert any(words in text for text in texts), texts
 
 
-def test_a_device_of_the_inventory_is_looked_for_when_the_agent_is_set_up(scenario):
+def test_a_device_of_the_inventory_is_looked_for_when_a_run_is_planned(scenario, capsys):
     text = SCENARIO.replace("lockstep", "realtime").replace(
         "hardware:\n", "hardware:\n  use: [{devices: [hat], agents: [agent-01]}]\n"
     )
     scenario.write_text(text)
 
-    load_scenario(scenario, (f"{GYRO}.device=hat.anything",))
+    given = (str(scenario), "--set", f"{GYRO}.device=hat.anything")
+    assert app.run(["validate", *given]) == 0
+    assert app.run(["plan", *given]) == 2
+    assert "no machine with agents has a device 'hat'" in capsys.readouterr().err
 
 
 @pytest.mark.process

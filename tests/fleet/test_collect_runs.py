@@ -165,9 +165,11 @@ def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator)
 
 def test_run_that_is_left_to_itself_is_collected_when_it_is_over(operator):
     scenario = operator.folder / "alone.yaml"
-    scenario.write_text(SCENARIO.replace("DURATION", "12"))
+    scenario.write_text(SCENARIO.replace("DURATION", "25"))
+    begun_s = time.monotonic()
     assert operator.cosmos("run", scenario, "-i", operator.inventory, "--detach").returncode == 0
 
+    is_early = time.monotonic() - begun_s < 12.0  # a busier computer may come when all is over
     early = operator.cosmos("collect")
     until_s = time.monotonic() + PATIENCE_S
     while operator.cosmos("collect", "--json", "--quiet").returncode == 2:
@@ -175,8 +177,8 @@ def test_run_that_is_left_to_itself_is_collected_when_it_is_over(operator):
         time.sleep(0.5)
     done = operator.cosmos("collect")
 
-    if early.returncode:  # a computer that is busier still comes when all is over
-        assert early.returncode == 2
+    assert early.returncode in ((2,) if is_early else (0, 2)), early.stderr
+    if early.returncode:
         assert "is still running" in early.stderr
     assert done.returncode == 0, done.stderr
     assert operator.document()["status"] == "complete"

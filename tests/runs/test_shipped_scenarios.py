@@ -40,15 +40,22 @@ def suite(folder, *words, patience_s):
 @pytest.mark.slow
 @pytest.mark.timeout(QUICK_S + 60)
 def test_each_shipped_scenario_passes_shortened(tmp_path):
-    meant = f"quick and not ({SAME_BENCHMARKS})"
-    if not shutil.which("cc"):
-        meant += " and not compiler"
+    meant = f"quick and not (compiler or {SAME_BENCHMARKS})"
     # Kept, so that what they recorded is looked at, as that of every run here.
     tests = suite(tmp_path, "-k", meant, "--keep", patience_s=QUICK_S)
 
     assert len(tests) >= 25
     assert all(figure["passed"] for figure in tests["hohmann5of10"]["figures"])
     assert len(tests["hohmann5of10"]["figures"]) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler here (Debian: gcc)")
+@pytest.mark.timeout(QUICK_S + 60)
+def test_each_shipped_scenario_that_is_compiled_passes_shortened(tmp_path):
+    tests = suite(tmp_path, "-k", "quick and compiler", "--keep", patience_s=QUICK_S)
+
+    assert set(tests) == {"detumble_models", "detumble_truth", "external_c"}
 
 
 @pytest.mark.nightly
