@@ -14,11 +14,12 @@ HANDED_ON = {"view/factory.py"}
 """Hands standard error to a view, which writes through the console."""
 BEFORE_ALL = {
     "start.py": [
+        "if sys.stderr is not None:\n    sys.stderr.flush()",
         "os.write(2, f'error: {memory_text()}\\n'.encode())",
         "sys.stderr.write('interrupted\\n')",
     ]
 }
-"""The only other words, all our own: while nothing is imported yet, and where there is no memory to do it."""
+"""The only other words, all our own: while nothing is imported yet, where there is no memory to do it, and the last flush."""
 FORBIDDEN_CALLS = {
     "print",
     "input",
