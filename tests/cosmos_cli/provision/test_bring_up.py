@@ -428,9 +428,11 @@ def test_wifi_that_may_carry_the_connection_stays(place):
 
 def test_machine_that_may_not_become_root_is_refused_before_anything_is_done(place, monkeypatch):
     read = MachineFacts.from_mapping
-    monkeypatch.setattr(
-        MachineFacts, "from_mapping", lambda told, **at: read({**told, "uid": 1000}, **at)
-    )
+
+    def as_another(told, **at):
+        return read({**told, "user": {**told["user"], "id": 1000}}, **at)
+
+    monkeypatch.setattr(MachineFacts, "from_mapping", as_another)
     kit = FakeKit(make_system(place / "system"))
     machine = machine_at(place, variables=WITHOUT_SUDO)
 
