@@ -103,7 +103,7 @@ class Recorded:
                 nothing = np.empty(count, dtype=object)  # of what another incarnation alone has
                 columns = {name: columns.get(name, nothing) for name in wanted}
                 yield {
-                    name: in_unit(values, units[name], own[name])[0]
+                    name: in_unit(values, units[name], own[name], self.role)[0]
                     if name in units and name in own
                     else values
                     for name, values in columns.items()

@@ -28,6 +28,8 @@ from madns_runtime.units import conversion, converted
 SIMULATED_UTC = "simulated_utc"
 METADATA_KEY = b"cosmos"
 NO_LABELS = TableLabels()
+DEVICE = "device"
+"""Role of devices: those of one name are no copies of each other, as agents are."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,14 +98,15 @@ def plan_table(
 
     Where incarnations or agents disagree on a field's kind, the wider one holds both: a float holds an
     int, and text holds anything. Where they disagree on its unit, the first one's holds for numbers, and
-    text has none. Packed fields have no column: only their simulation reads them.
+    text has none; nor has a column of devices of one name that measure different things. Packed fields have
+    no column: only their simulation reads them.
     """
     merged: dict[str, Field] = {}
+    role = files[0].role
     for file in files:
         for field in (*file.fields, *(() if file.is_array else (DETAILS,))):
             known = merged.get(field.name)
-            merged[field.name] = field if known is None else _wider(known, field)
-    role = files[0].role
+            merged[field.name] = field if known is None else _wider(known, field, role)
     has_tick = "tick" in merged and merged["tick"].kind in NUMBER_KINDS
     needs_time = has_tick and "t_s" not in merged and role == "agent"
     source_column: str = role
@@ -119,16 +122,17 @@ def plan_table(
     )
 
 
-def in_unit(values: NDArray[Any], unit: str, column: Field) -> tuple[NDArray[Any], int]:
+def in_unit(values: NDArray[Any], unit: str, column: Field, role: str) -> tuple[NDArray[Any], int]:
     """
     Return a file's values of a field in the unit of its column, and how many became null on the way.
 
     Args:
         values: As recorded.
         unit: Of them.
-        column: The field as the table has it. Text stays as it was recorded.
+        column: The field as the table has it. Text stays as it was recorded, and so do devices' numbers where it has no unit.
+        role: The table's.
     """
-    if column.kind not in NUMBER_KINDS:
+    if column.kind not in NUMBER_KINDS or (role == DEVICE and not column.unit):
         return values, 0
     factor = _factor(unit, column.unit)
     if factor == 1.0:
@@ -155,7 +159,7 @@ def _scaled(value: float, factor: float | None) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _wider(first: Field, second: Field) -> Field:
+def _wider(first: Field, second: Field, role: str) -> Field:
     kinds = {first.kind, second.kind}
     kind = first.kind
     if kinds == {"int", "float"}:
@@ -164,7 +168,8 @@ def _wider(first: Field, second: Field) -> Field:
         kind = "json"
     if first.unit == second.unit:
         return replace(first, kind=kind)
-    if kind not in NUMBER_KINDS:
+    is_apart = role == DEVICE and (not first.unit or _factor(second.unit, first.unit) is None)
+    if kind not in NUMBER_KINDS or is_apart:
         return replace(first, unit="", kind=kind)
     is_whole = _factor(second.unit, first.unit) in (None, 1.0)
     return replace(first, kind=kind if is_whole else "float")

@@ -140,7 +140,7 @@ class TableWriter:
         """Return what is held of a field, in its column's unit."""
         values = _join([batch.get(field.name) for batch in self._held], count)
         unit = next((own.unit for own in file.fields if own.name == field.name), field.unit)
-        values, lost = in_unit(values, unit, field)
+        values, lost = in_unit(values, unit, field, self._layout.role)
         if lost:
             told = f"{field.name} of {file.source} is in {unit or '1'}, the table's in {field.unit or '1'}"
             self.foreign[told] = self.foreign.get(told, 0) + lost

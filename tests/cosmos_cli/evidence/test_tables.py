@@ -2,6 +2,7 @@ import dataclasses
 import datetime
 import errno
 import hashlib
+import math
 import os
 import subprocess
 import sys
@@ -318,6 +319,35 @@ def test_numbers_that_measure_something_else_are_null_and_a_fault_of_the_table(t
     table = TableReader(made.run.tables / "radar.parquet")
     assert table.read("agent-01", ("range_",))["range_"].tolist() == [7.0]
     assert np.isnan(table.read("agent-02", ("range_",))["range_"]).all()
+
+
+@pytest.mark.parametrize(
+    ("unit", "told", "expected"),
+    [("deg/s", "rad/s", [0.0, math.pi]), ("V", "", [0.0, 180.0]), ("", "", [0.0, 180.0])],
+)
+def test_devices_of_one_name_that_measure_different_things_have_a_column_without_a_unit(
+    tmp_path, unit, told, expected
+):
+    """They are no copies of each other, as agents are: nothing is wrong, and no value is lost."""
+    made = SyntheticRun(tmp_path)
+    for place, own, values in (
+        ("a", "rad/s", [1.0]),
+        ("b", unit, [0.0, 180.0]),
+        ("c", "rad/s", [2.0]),
+    ):
+        schema = StreamSchema("gyro", (Field("t_s", "s"), Field("rate", own)))
+        recorder = made.recorder(f"devices/{place}/imu", f"{place}/imu", schema)
+        for row in enumerate(values):
+            recorder.record("gyro", row)
+        recorder.close()
+
+    gathered = gather(made.run, 10.0, quiet)
+
+    table = TableReader(made.run.tables / "device_imu.gyro.parquet")
+    assert gathered.faults == ()
+    assert table.fields[1] == Field("rate", told)
+    assert table.read("b/imu", ("rate",))["rate"].tolist() == pytest.approx(expected)
+    assert table.read("c/imu", ("rate",))["rate"].tolist() == [2.0]
 
 
 def test_a_column_of_text_from_different_units_has_none(tmp_path):
