@@ -78,12 +78,17 @@ def test_a_document_that_is_nested_too_deep_is_named(made, name, text):
     assert summary.exit_code != 0
 
 
-def test_details_of_an_event_that_are_nested_deep_are_kept_as_they_are(made):
+def record_event(made, more):
+    """Put an event with more than its stream's fields before the end of an agent's."""
     stream = made.stream("agent-01", "events")
     first, *rest = stream.read_bytes().splitlines(keepends=True)
-    event = b'{"t_s":0.0,"utc":null,"event":"x","more":%s}\n' % nested(300).encode()
+    event = b'{"t_s":0.0,"utc":null,"event":"x","more":%s}\n' % more.encode()
     end = json.dumps({"end": {"records": 2, "dropped": 0, "not_finite": 0}}).encode()
     stream.write_bytes(b"".join((first, *rest[:-1], event, end, b"\n")))
+
+
+def test_details_of_an_event_that_are_nested_deep_are_kept_as_they_are(made):
+    record_event(made, nested(300))
 
     summary = collected(made)
 
@@ -98,11 +103,7 @@ def test_details_of_an_event_that_are_nested_deep_are_kept_as_they_are(made):
 
 
 def test_details_of_an_event_that_are_nested_deeper_than_python_goes_are_counted(made):
-    stream = made.stream("agent-01", "events")
-    first, *rest = stream.read_bytes().splitlines(keepends=True)
-    event = b'{"t_s":0.0,"utc":null,"event":"x","more":%s}\n' % nested(1000).encode()
-    end = json.dumps({"end": {"records": 2, "dropped": 0, "not_finite": 0}}).encode()
-    stream.write_bytes(b"".join((first, *rest[:-1], event, end, b"\n")))
+    record_event(made, nested(1000))
 
     summary = collected(made)
 

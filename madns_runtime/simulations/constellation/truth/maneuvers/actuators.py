@@ -88,10 +88,10 @@ class Tank:
         waiting = [each for each in self._booked if each[1] > now_s]
         self._booked, own_kg = [], burn.propellant_kg
         for begins_s, ends_s, kg in waiting:
-            if begins_s > start_s:  # the vehicle is still as heavy, and lighter afterwards
-                own_kg += burn.burnt * kg
-                kg -= burn.burnt * kg  # noqa: PLW2901 - what is left of it
-            self._booked.append((begins_s, ends_s, kg))
+            # Before a later one the vehicle is still as heavy, and lighter afterwards.
+            moved_kg = burn.burnt * kg if begins_s > start_s else 0.0
+            own_kg += moved_kg
+            self._booked.append((begins_s, ends_s, kg - moved_kg))
         self._booked.append((start_s, end_s, own_kg))
         self.burn(burn.propellant_kg)
 
