@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
+from cosmos_cli.collect.finished_run import changed_tables
 from cosmos_cli.collect.unread_files import find_unread, told_unread
 from cosmos_cli.diff.recorded import Key, Lines, Recorded
 from cosmos_cli.diff.side import Side, check_comparable
@@ -200,11 +201,12 @@ def _compare_streams(
         pairing = choose_pairing(of_a[key].fields, of_b[key].fields, (a.tick_hz, b.tick_hz))
         # The same numbers under other names, or in another unit, are others.
         is_alike = of_a[key].fields == of_b[key].fields
-        lines, other = (one[key].lines() if is_alike else None for one in (of_a, of_b))
-        _note_changes(result, lines, other)
+        lines, other = of_a[key].lines(), of_b[key].lines()
+        _note_changes(result, a, lines)
+        _note_changes(result, b, other)
         # The same ticks at different rates are other instants.
         is_same_time = pairing.scales[0] == pairing.scales[1]
-        is_identical = bool(lines and other and is_same_time and lines.is_same(other))
+        is_identical = bool(lines and other and is_alike and is_same_time and lines.is_same(other))
         if lines is not None and is_identical:
             identical[key] = lines.records
         if lines is not None and is_identical and not selection.parts(of_a[key]):
@@ -215,20 +217,29 @@ def _compare_streams(
             found.is_identical = found.is_identical or is_identical
         result.streams.append(found)
         done += size
+    if selection == Selection():
+        progress("looking for changes in what is not compared", 1.0)
+        for side in (a, b):
+            for key, stream in side.streams.items():
+                if key not in common:
+                    _note_changes(result, side, stream.lines())
+    changed = [f"{side.run.name}: {line}" for side in (a, b) for line in changed_tables(side.run)]
+    result.missing += changed
     progress("comparing by the simulation", 1.0)
     try:
+        if changed:
+            raise PluginError("tables are not as they were collected")
         _compare_by_simulation(result, of_a, of_b, identical)
     except PluginError as error:
         result.remarks.append(f"{a.simulation} compared nothing itself: {error}")
 
 
-def _note_changes(result: Comparison, *lines: Lines | None) -> None:
+def _note_changes(result: Comparison, side: Side, lines: Lines | None) -> None:
     """Enter files whose hash is not what it was: their length may be, which was looked at before."""
-    for side, own in zip((result.a, result.b), lines, strict=True):
-        for path in own.changed if own is not None else ():
-            name = f"{side.run.name}: {path.relative_to(side.run.path).as_posix()}: "
-            if not any(line.startswith(name) for line in result.missing):
-                result.missing.append(f"{name}changed since the run was collected")
+    for path in lines.changed if lines is not None else ():
+        name = f"{side.run.name}: {path.relative_to(side.run.path).as_posix()}: "
+        if not any(line.startswith(name) for line in result.missing):
+            result.missing.append(f"{name}changed since the run was collected")
 
 
 def _compare_by_simulation(

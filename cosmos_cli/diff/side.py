@@ -6,7 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from cosmos_cli.collect.finished_run import collected_document, refuse_foreign_tables
+from cosmos_cli.collect.finished_run import (
+    collected_document,
+    is_as_listed,
+    listed_files,
+    refuse_foreign_tables,
+)
 from cosmos_cli.collect.previous_manifest import Earlier, is_there
 from cosmos_cli.diff.recorded import Key, Recorded, recorded_streams
 from cosmos_cli.errors import InputError
@@ -107,13 +112,17 @@ def open_side(run: RunDirectory, given: str) -> Side:
 
 
 def _changed_since(run: RunDirectory) -> Iterator[str]:
-    """Tell of streams that are gone, or have another length than the manifest says."""
-    for name, entry in Earlier.read(run).entries.items():
-        if not name.endswith(SUFFIX):
-            continue
+    """Tell of files that are gone or changed; of streams by their length alone, as they are hashed when they are read."""
+    own = {name: entry for name, entry in listed_files(run).items() if name == run.run_json.name}
+    for name, entry in {**Earlier.read(run).entries, **own}.items():
+        if name.startswith(f"{run.tables.name}/"):
+            continue  # can be made anew
         path, was = run.path / name, entry.get("bytes")
         if not is_there(run, name):
             yield f"{name}: missing; it was there when the run was collected"
+        elif not name.endswith(SUFFIX):
+            if "sha256" in entry and not is_as_listed(entry, path):
+                yield f"{name}: changed since the run was collected"
         elif (now := path.stat().st_size) != was:
             yield f"{name}: changed since the run was collected ({now} bytes, were {was})"
 

@@ -219,12 +219,15 @@ def _distance(entry: Path, errors: Sequence[Located]) -> tuple[bool, int, int, i
     """
     Return how far a member is from what was written: of another type, then by its tag, then by all errors.
 
-    Errors in a union further in say nothing here: each of its members has one.
+    Errors in a union further in say nothing here: each of its members has one. Nor do wrong keys further in, of which
+    the member that is meant may have many.
     """
     is_misfit = any(item.path == entry and item.error["type"].endswith("_type") for item in errors)
     own = [item for item in errors if item.branches and item.branch[:-1] == entry]
     decisive = sum(
-        item.error["type"] in ("literal_error", *_UNKNOWN) or item.path == entry for item in own
+        item.path == entry
+        or (item.error["type"] in ("literal_error", *_UNKNOWN) and len(item.path) == len(entry) + 1)
+        for item in own
     )
     return is_misfit, sum(_is_tag(item, entry) for item in errors), decisive, len(errors)
 

@@ -77,16 +77,21 @@ class ValueBounds:
 
     def holds(self, value: object) -> bool:
         """Tell whether a recorded value lies within."""
+        return self.find(value) is True
+
+    def find(self, value: object) -> bool | None:
+        """Tell whether a recorded value lies within or outside; None of one that is neither."""
         if self.text is not None:
-            return isinstance(value, str) and (value == self.text) is not self.is_negated
+            return (value == self.text) is not self.is_negated if isinstance(value, str) else None
         if isinstance(value, str):  # where records are counted, whatever they hold
-            return self.low is None and self.high is None and not self.is_negated
+            is_counted = self.low is None and self.high is None
+            return not self.is_negated if is_counted else None
         try:
             number = float(value)  # type: ignore[arg-type]  # numpy's numbers are none of Python's
         except (TypeError, ValueError):
-            return False
+            return None
         if not math.isfinite(number):
-            return False
+            return None
         is_within = (
             (self.low is None or number >= self.low) and (self.high is None or number <= self.high)
             if self.is_closed

@@ -40,7 +40,10 @@ class ConditionEvaluator:
         if self.is_met or not condition.is_at(t_s):
             return None
         at_s = 0.0 if t_s is None else t_s
-        if not condition.bounds.holds(value):
+        is_within = condition.bounds.find(value)
+        if is_within is None:
+            return self.look(at_s)  # nothing is known of it: the value before is still the newest
+        if not is_within:
             # Until this record the one before it was the newest: it may have held for long enough, with nobody looking.
             met_s = self.look(math.nextafter(at_s, -math.inf))
             self._since_s = None

@@ -179,8 +179,8 @@ class ConditionTap:
         return lambda read: _seconds(read(seconds))
 
     def _own_or_present_s(self, t_s: float | None) -> float | None:
-        """Return a record's time; the present of one that tells none, or one that is null on record."""
-        return t_s if t_s is not None and math.isfinite(t_s) else self._present_s()
+        """Return a record's time, 0 before it runs; the present of one that tells none, or one that is null on record."""
+        return max(t_s, 0.0) if t_s is not None and math.isfinite(t_s) else self._present_s()
 
     def _present_s(self) -> float | None:
         now_s = self._now_s()

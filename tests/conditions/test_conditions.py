@@ -75,6 +75,20 @@ def test_a_condition_has_held_until_the_record_with_which_it_does_not_any_more()
     assert evaluator.take(4.0, 11) is None
 
 
+@pytest.mark.parametrize("absent", [None, math.nan, -math.inf])
+def test_a_value_that_is_not_there_ends_no_while(absent):
+    evaluator = ConditionEvaluator(condition(for_s=2.0))
+
+    assert [evaluator.take(t, v) for t, v in ((0.0, 11), (1.0, absent))] == [None, None]
+    assert evaluator.take(2.5, absent) == 2.0
+    counting = ConditionEvaluator(condition(times=2))
+    assert [counting.take(t, v) for t, v in ((0.0, 11), (1.0, absent), (2.0, 11))] == [
+        None,
+        None,
+        2.0,
+    ]
+
+
 def test_a_while_that_is_no_binary_number_is_over_at_its_tick():
     evaluator = ConditionEvaluator(condition(for_s=0.2))
 
@@ -127,6 +141,20 @@ def test_what_is_recorded_before_simulated_time_counts_as_of_its_begin(now_s):
     tap.look(5.0)
 
     assert told == [(1, "a", 0.0), (0, "a", 5.0)]
+
+
+def test_what_a_record_dates_before_simulated_time_counts_as_of_its_begin():
+    lasting, first = condition(for_s=0.4), condition(number=1)
+    tap, told = tapped((lasting, first))
+    take = tap.open("drive", ("t_s", "speed_m_s"))
+
+    take((-0.5, 11.0))
+    take((0.1, 11.0))
+    tap.look(0.3)
+    assert told == [(1, "a", 0.0)]
+    tap.look(0.4)
+
+    assert told == [(1, "a", 0.0), (0, "a", 0.4)]
 
 
 @pytest.mark.parametrize("t_s", [math.nan, math.inf, -math.inf])

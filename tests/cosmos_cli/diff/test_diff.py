@@ -308,6 +308,42 @@ def test_a_digit_that_changed_on_the_disk_is_named_and_never_the_same(make, caps
     ]
 
 
+@pytest.mark.parametrize("name", ["agents/agent-03/events.jsonl", "plan.json", "run.json"])
+def test_what_changed_beside_the_compared_streams_is_named_and_never_the_same(make, capsys, name):
+    make()
+    harmed = make()
+    path = harmed.run.path / name
+    data = path.read_bytes()
+    at = max(data.rindex(digit) for digit in (b"0", b"1", b"2") if digit in data)
+    path.write_bytes(data[:at] + b"7" + data[at + 1 :])
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    assert (code, document["same"]) == (1, False)
+    assert document["missing"] == [f"0002-synthetic: {name}: changed since the run was collected"]
+
+
+def test_of_changed_tables_nothing_is_told_by_the_simulation(make, capsys, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        "cosmos_cli.diff.compare._compare_by_simulation", lambda *_: asked.append(1)
+    )
+    make()
+    assert diff(capsys, "1", "1")[0] == 0
+    assert asked == [1]
+    table = make().run.tables / "state.parquet"
+    before = table.stat()
+    table.write_bytes(table.read_bytes()[:-9] + b"7" + table.read_bytes()[-8:])
+    os.utime(table, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+    code, document = diff(capsys, "1", "2", "--expect-same")
+
+    assert (code, document["same"], asked) == (1, False, [1])
+    (line,) = document["missing"]
+    assert line.startswith("0002-synthetic: tables/state.parquet is not as it was collected")
+    assert any("compared nothing itself" in line for line in document["remarks"])
+
+
 def test_tables_of_another_run_are_not_read_for_its_own(make, capsys):
     first, second = make(), make(change_record)
     shutil.rmtree(second.run.tables)

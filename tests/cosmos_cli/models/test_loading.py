@@ -599,6 +599,14 @@ FLYING = "satellites: {walker: '56:1/1/0', altitude_km: 500}\n  flight: {command
             ["parameters.satellites.keplerian[0].e: expected < 1, got 1.2"],
         ),
         (
+            ORBIT.replace("e: 1.2}", "inc: 1}").replace("km: 500}]", "km: 500, inc: 1}]"),
+            [
+                f"parameters.satellites.keplerian[{number}].inc: unknown key; known here: name, a_km, "
+                "altitude_km, e, i_deg, raan_deg, argp_deg, mean_anomaly_deg"
+                for number in (0, 1)
+            ],
+        ),
+        (
             "satellites: {keplerian: []}",
             ["parameters.satellites.keplerian: expected at least 1 items, got a list"],
         ),
