@@ -8,6 +8,8 @@ import pytest
 from harness.cosmos_command import LOOSE, SCENARIOS, CosmosCommand
 from harness.firmware import build_firmware, needs_emulator
 
+from cosmos_cli.evidence.manifest import file_entry
+
 pytestmark = pytest.mark.process
 
 DRIVER = """
@@ -310,6 +312,10 @@ def changed(braked, tmp_path):
     plan = json.loads((copy / "plan.json").read_text())
     plan["config"]["base_directory"] = str(today)
     (copy / "plan.json").write_text(json.dumps(plan))
+    # As if it had been collected so.
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["files"]["plan.json"] = file_entry(copy / "plan.json")
+    (copy / "manifest.json").write_text(json.dumps(manifest))
     return CosmosCommand(tmp_path, COSMOS_CACHE=str(tmp_path / "cache")), copy
 
 
