@@ -170,11 +170,13 @@ class MachineFacts:
     environments: frozenset[str] = frozenset()
     """Keys of wanted environments that are there, whole and unchanged."""
     prunable: tuple[str, ...] = ()
-    """Trees, environments and wheels that nobody uses, such as trees/<hash>."""
+    """Trees, environments and wheels that nobody uses, such as trees/<hash>, and what was left half made."""
     prunable_bytes: int = 0
     """Room that these take on the disk, at least."""
     wheels: frozenset[str] = frozenset()
     """Names of the dist-info folders of wheels that are there, if a wanted environment is not."""
+    blobs: frozenset[str] = frozenset()
+    """Hashes of files that were sent there and belong to no tree yet, if a wanted tree is not there."""
 
     @classmethod
     def from_mapping(

@@ -120,6 +120,7 @@ def _with_installed(facts: MachineFacts, told: Mapping[str, Any]) -> MachineFact
         prunable=tuple(f"{kind}/{name}" for kind, names in prunable.items() for name in names),
         prunable_bytes=told.get("prunable_bytes", 0),
         wheels=frozenset(told.get("wheels") or ()),
+        blobs=frozenset(told.get("blobs") or ()),
     )
 
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.metadata
+import io
 import os
 import stat
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import madns_runtime
 from cosmos_cli.cache import cache_folder
@@ -25,7 +26,7 @@ from cosmos_cli.evidence.run_directory import BUNDLE_SUFFIX, RUN_NAME
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from madns_runtime.bounded_files import read_regular_file, real_path
+from madns_runtime.bounded_files import open_regular_file, read_regular_file, real_path
 from madns_runtime.processes import state_directory
 
 if TYPE_CHECKING:  # importing the scenario's model takes longer than all that is done with it here
@@ -35,8 +36,11 @@ DISTRIBUTION = "cosmos-madns"
 FILES_MAX = 5_000
 TREE_BYTES_MAX = 256 * 1024 * 1024
 BATCH_BYTES = 4 * 1024 * 1024
-"""Bytes of content per frame; a batch is compressed as one."""
+"""Bytes of content per frame: what is in it is compressed as one, and a larger file comes in several."""
 COMPRESSION_LEVEL = 6
+SAMPLE_BYTES = 65_536
+DENSE_SHARE = 0.9
+"""What compression leaves at least so much of is sent as it is: every machine's copy costs processor time here."""
 ROUNDS_MAX = 3
 """Another operator who assembles the same tree at the same time may take what was just sent."""
 ASSEMBLE_TIMEOUT_S = 120.0
@@ -73,21 +77,39 @@ class TreeFile:
         Raises:
             MachineFailure: It is no longer what it was when the tree was made.
         """
+        return b"".join(self.pieces(BATCH_BYTES))
+
+    def pieces(self, bytes_max: int) -> Iterator[bytes]:
+        """
+        Yield its content in pieces, the last one when all of it is known to be right.
+
+        Raises:
+            MachineFailure: As `read`.
+        """
+        digest, left_bytes = hashlib.sha256(), self.size_bytes
         try:
-            content = (
-                self.source
-                if isinstance(self.source, bytes)
-                else read_regular_file(self.source, bytes_max=self.size_bytes)
-            )
-        except OSError:  # it is gone or has grown, or a pipe has taken its place
-            content = None
-        if content is None or hashlib.sha256(content).hexdigest() != self.sha256:
+            with self._opened() as stream:
+                while piece := stream.read(min(left_bytes, bytes_max)):
+                    left_bytes -= len(piece)
+                    digest.update(piece)
+                    if not left_bytes:
+                        break
+                    yield piece
+                is_right = not stream.read(1) and digest.hexdigest() == self.sha256
+        except OSError:  # it is gone, or a pipe has taken its place
+            is_right = False
+        if not is_right:
             raise MachineFailure(
                 FailureKind.DATA,
                 f"{self.source!s} was changed or removed while it was sent",
                 "repeat",
             )
-        return content
+        yield piece
+
+    def _opened(self) -> BinaryIO:
+        if isinstance(self.source, bytes):
+            return io.BytesIO(self.source)
+        return os.fdopen(open_regular_file(self.source), "rb")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,15 +224,36 @@ def _send_blobs(
 ) -> None:
     whole_bytes = sum(file.size_bytes for file in files)
     sent_bytes = 0
-    for batch in _batches(files):
-        body = zlib.compress(b"".join(file.read() for file in batch), COMPRESSION_LEVEL)
-        arguments = {
-            "folder": layout.trees,
-            "blobs": [[file.sha256, file.size_bytes] for file in batch],
-        }
-        helper.call("blobs", arguments, body=body, timeout_s=ASSEMBLE_TIMEOUT_S)
-        sent_bytes += sum(file.size_bytes for file in batch)
+    for verb, arguments, content in _frames(files):
+        helper.call(
+            verb,
+            {"folder": layout.trees, **arguments},
+            body=_packed(content),
+            timeout_s=ASSEMBLE_TIMEOUT_S,
+        )
+        sent_bytes += len(content)
         progress(f"files {sent_bytes / 1e6:.1f} MB", sent_bytes / max(1, whole_bytes))
+
+
+def _frames(files: Sequence[TreeFile]) -> Iterator[tuple[str, Mapping[str, Any], bytes]]:
+    """Yield verb, arguments and content of each frame: many small files together, a large one in pieces."""
+    for batch in _batches([file for file in files if file.size_bytes <= BATCH_BYTES]):
+        blobs = [[file.sha256, file.size_bytes] for file in batch]
+        yield "blobs", {"blobs": blobs}, b"".join(file.read() for file in batch)
+    for file in files:
+        offset = 0
+        for piece in file.pieces(BATCH_BYTES) if file.size_bytes > BATCH_BYTES else ():
+            place = {"size": file.size_bytes, "offset": offset, "length": len(piece)}
+            yield "blob", {"sha256": file.sha256, **place}, piece
+            offset += len(piece)
+
+
+def _packed(content: bytes) -> bytes:
+    """Return content in the form of zlib; what its midst shows to be packed already is not compressed once more."""
+    middle = len(content) // 2
+    sample = content[middle : middle + SAMPLE_BYTES]
+    is_dense = len(zlib.compress(sample, COMPRESSION_LEVEL)) > DENSE_SHARE * len(sample)
+    return zlib.compress(content, 0 if is_dense else COMPRESSION_LEVEL)
 
 
 def _batches(files: Sequence[TreeFile]) -> Iterator[list[TreeFile]]:

@@ -85,6 +85,7 @@ def questions(root: Path) -> dict[str, dict]:
         "several": {"calls": [call("look", look), call("living", {})]},
         "tree": {"folder": f"{own}/trees", **A_TREE},
         "blobs": {"folder": f"{own}/trees", "blobs": []},
+        "blob": {"folder": f"{own}/trees", "sha256": EMPTY, "size": 1, "offset": 0, "length": 0},
         "environment": {
             "folder": f"{own}/environments",
             "wheels_folder": f"{own}/wheels",

@@ -16,6 +16,7 @@ from cosmos_cli.onboard.files import replace_file
 from cosmos_cli.provision.gather_facts import gather_facts
 from cosmos_cli.provision.step import Kind, Step
 from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, notes_of, plan_steps
+from cosmos_cli.provision.trees import TreeFile, tree_of
 from cosmos_cli.provision.up import MachineUp, UpOptions
 from cosmos_cli.provision.up_table import MachineResult
 
@@ -59,7 +60,10 @@ class FakeEnvironment:
 class FakeTree:
     label: str = "runtime"
     hash: str = "0123456789abcdef"
-    files: tuple = ("a", "b", "c")
+    files: tuple = tuple(
+        TreeFile(path=name, sha256=name * 64, mode=0o444, size_bytes=1, source=b"")
+        for name in ("a", "b", "c")
+    )
     size_bytes: int = 1_000_000
 
 
@@ -205,6 +209,19 @@ def test_wheels_that_are_there_take_no_room():
 
     assert step.size_bytes == ENVIRONMENT_BYTES // 2
     check_possible(facts_of(disk={"free_bytes": ENVIRONMENT_BYTES}), (step,))
+
+
+def test_what_was_sent_before_needs_no_room_again():
+    files = tuple(
+        TreeFile(path=name, sha256=sha256, mode=0o444, size_bytes=1000, source=b"")
+        for name, sha256 in (("a", "aa"), ("b", "aa"), ("c", "cc"))
+    )
+    first, second = tree_of("first", files), tree_of("second", files[1:])
+    facts = dataclasses.replace(facts_of(), blobs=frozenset({"aa", "dd"}))
+
+    steps = plan_steps(facts, wanted(trees=(first, second)))
+
+    assert [step.size_bytes for step in steps] == [2000, 2000]
 
 
 @pytest.mark.parametrize("missing_bytes", [0, 1])
