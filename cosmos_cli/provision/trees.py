@@ -20,14 +20,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import madns_runtime
-from cosmos_cli.cache import cache_folder
 from cosmos_cli.errors import InputError
-from cosmos_cli.evidence.run_directory import BUNDLE_SUFFIX, RUN_NAME
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from madns_runtime.bounded_files import open_regular_file, read_regular_file, real_path
-from madns_runtime.processes import state_directory
+from cosmos_cli.provision.tree_rules import walk
+from madns_runtime.bounded_files import open_regular_file, read_regular_file
 
 if TYPE_CHECKING:  # importing the scenario's model takes longer than all that is done with it here
     from cosmos_cli.models.loading import ScenarioFile
@@ -45,8 +43,6 @@ ROUNDS_MAX = 3
 """Another operator who assembles the same tree at the same time may take what was just sent."""
 ASSEMBLE_TIMEOUT_S = 120.0
 LARGEST_SHOWN = 3
-CACHE_FOLDERS = ("__pycache__", "node_modules")
-CACHE_SUFFIXES = (".pyc", ".egg-info")
 FILE_MODE, PROGRAM_MODE = 0o444, 0o555
 
 Progress = Callable[[str, float], None]
@@ -148,7 +144,7 @@ def runtime_tree() -> Tree:
     package = Path(madns_runtime.__file__).parent
     files = [
         read_tree_file(path, f"{package.name}/{name}")
-        for path, name in _walk(package, package)
+        for path, name in walk(package)
         if name.endswith((".py", ".json", "py.typed")) or "/data/" in f"/{name}"
     ]
     return tree_of("runtime", [*files, *_distribution_files()])
@@ -158,11 +154,11 @@ def scenario_tree(scenario_file: ScenarioFile) -> Tree:
     """
     Return the scenario's folder: what its files name, and its plug-ins with their neighbours.
 
-    Hidden files, caches, virtual environments, runs, COSMoS's own state and empty folders are left out. A link to a file or
-    folder within is sent as what it leads to.
+    Hidden files, caches, virtual environments, runs, COSMoS's own state and empty folders are left out, and so are links
+    to such. A link to a file or folder within is sent as what it leads to.
 
     Raises:
-        InputError: The folder is larger than a scenario's should be, or has a link that leads outside.
+        InputError: The folder is larger than a scenario's should be, or has another link that leads outside.
     """
     return folder_tree(f"scenario {scenario_file.scenario.name}", scenario_file.base_directory)
 
@@ -176,7 +172,7 @@ def folder_tree(label: str, folder: Path) -> Tree:
     """
     found = []
     total_bytes = 0
-    for path, name in _walk(folder, folder):
+    for path, name in walk(folder):
         found.append((path, name))
         total_bytes += _size_bytes(path)
         if len(found) > FILES_MAX or total_bytes > TREE_BYTES_MAX:
@@ -309,96 +305,11 @@ def _file(name: str, content: bytes, mode: int, source: Path | None = None) -> T
     )
 
 
-def entries_in(folder: Path) -> list[os.DirEntry[str]]:
-    """
-    Return what lies in a folder, by name.
-
-    Raises:
-        InputError: It cannot be read.
-    """
-    try:
-        return sorted(os.scandir(folder), key=lambda entry: entry.name)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read: {error.strerror or error}") from error
-
-
-def _walk(folder: Path, top: Path, above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, str]]:
-    """Yield the files of a folder that belong to a tree, each with its path within *top*."""
-    above = (*above, folder.resolve())
-    for entry in entries_in(folder):
-        path = folder / entry.name
-        if not is_name_of_tree(entry.name):
-            continue
-        if not entry.name.isprintable():
-            raise InputError(f"{str(path)!r}: expected a file name of printable characters")
-        if entry.is_symlink():
-            _refuse_outside(path, top)
-        try:
-            kind = _kind(entry, path, above)
-        except OSError as error:  # such as a link to itself
-            raise InputError(f"{path}: cannot be read: {error.strerror}; remove it") from error
-        if kind == "link":
-            raise InputError(f"{path}: a link that leads nowhere; remove it")
-        if kind == "folder":
-            yield from _walk(path, top, above)
-        elif kind:
-            yield path, path.relative_to(top).as_posix()
-
-
-def _kind(entry: os.DirEntry[str], path: Path, above: tuple[Path, ...]) -> str:
-    """Return what an entry is: a folder or file that belongs to the tree, a link to nothing, or empty for the rest."""
-    if entry.is_dir():
-        return "folder" if real_path(path) not in above and is_folder_of_tree(path) else ""
-    if entry.is_file():
-        return "file"
-    return "link" if entry.is_symlink() else ""
-
-
-def is_name_of_tree(name: str) -> bool:
-    """Tell whether what has this name may belong to a tree: no hidden file, no cache, no package of a run."""
-    is_bundle = name.endswith(BUNDLE_SUFFIX) and RUN_NAME.match(name) is not None
-    return not (name.startswith(".") or name.endswith(CACHE_SUFFIXES) or is_bundle)
-
-
-def is_folder_of_tree(path: Path) -> bool:
-    """Tell whether a folder belongs to a tree: no cache, virtual environment or run, nor what COSMoS itself keeps there."""
-    return not (
-        _is_run(path)
-        or path.name in CACHE_FOLDERS
-        or os.path.exists(path / "pyvenv.cfg")
-        or _is_own(path)
-    )
-
-
-def _is_own(path: Path) -> bool:
-    """Tell whether a folder is where this computer's state or cache is kept: it changes with every run."""
-    register = state_directory()
-    kept = (register, register.parent, cache_folder())
-    return os.path.realpath(path) in map(os.path.realpath, kept)
-
-
-def _is_run(path: Path) -> bool:
-    """Tell whether a folder is a run's: by its name and part of what it holds, or renamed, as a copy is, by all of it."""
-    is_planned = os.path.exists(path / "plan.json")  # of a folder that may not be entered: False
-    has_records = os.path.isdir(path / "host") and os.path.isdir(path / "agents")
-    is_named = RUN_NAME.match(path.name) is not None
-    return (is_planned or has_records) if is_named else (is_planned and has_records)
-
-
 def _size_bytes(path: Path) -> int:
     try:
         return path.stat().st_size
     except OSError as error:  # removed since the folder was listed
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _refuse_outside(path: Path, top: Path) -> None:
-    real = real_path(path)
-    if not real.is_relative_to(top.resolve()):
-        raise InputError(
-            f"{path}: a link that leads out of the scenario's folder, to {real}; machines are sent"
-            f" {top} and no more, so copy into it what the scenario needs"
-        )
 
 
 def _too_large(folder: Path, found: Sequence[tuple[Path, str]]) -> InputError:

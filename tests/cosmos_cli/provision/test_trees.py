@@ -16,15 +16,16 @@ from onboard_machine import OwnMachine, snapshot
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.launch import flown_copy
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.onboard import installed
 from cosmos_cli.onboard import trees as onboard_trees
 from cosmos_cli.onboard.request_loop import VERBS, VerbRequest
-from cosmos_cli.provision import trees
+from cosmos_cli.provision import tree_rules, trees
 from cosmos_cli.provision.environment import ask_installed, installed_request
+from cosmos_cli.provision.tree_rules import is_folder_of_tree
 from cosmos_cli.provision.trees import (
     TreeFile,
-    is_folder_of_tree,
     runtime_tree,
     scenario_tree,
     send_tree,
@@ -179,6 +180,58 @@ def test_links_within_are_sent_as_what_they_lead_to(folder, machine):
 
     assert "alias.csv" in paths(tree) and "more/orbits.csv" in paths(tree)
     assert on_machine(machine, tree)["alias.csv"] == b"1,2\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "files"),
+    [
+        ("runs", "runs", ()),
+        ("results", "big", ("0007-small/plan.json", "0008-small.tar.zst", ".index")),
+        ("0007-small", "moved", ("host/x", "agents/x")),
+        ("last", "0007-small", ("plan.json",)),
+        ("env", "env", ("pyvenv.cfg", "bin/python")),
+        ("node_modules", "modules", ("x.js",)),
+    ],
+)
+def test_links_to_what_is_left_out_are_left_out_wherever_it_lies(folder, name, target, files):
+    before = the_tree(folder)
+    for path in (folder.parent / "disk" / target / file for file in files):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("x")
+    (folder.parent / "disk" / target).mkdir(parents=True, exist_ok=True)
+    (folder / name).symlink_to(folder.parent / "disk" / target)
+
+    assert the_tree(folder).hash == before.hash
+    assert set(flown_copy.names_in(folder)) == set(paths(before))
+    assert flown_copy._found(folder, left_out := []) and not left_out
+
+
+def test_link_to_the_folder_of_all_runs_is_left_out_whatever_else_is_there(folder, monkeypatch):
+    before = the_tree(folder)
+    disk = folder.parent / "disk"
+    disk.mkdir()
+    (disk / "notes.txt").write_text("x")
+    (folder / "results").symlink_to(disk)
+    with pytest.raises(InputError, match=r"results: a link that leads out"):
+        the_tree(folder)
+
+    monkeypatch.setenv("COSMOS_RUNS", str(disk))
+
+    assert the_tree(folder).hash == before.hash
+
+
+def test_links_to_folders_with_links_end_with_a_word(folder, monkeypatch):
+    """Each level doubles the ways to the last one."""
+    monkeypatch.setattr(tree_rules, "FOLDERS_MAX", 100)
+    for level in range(30):
+        inner = folder / f"level{level}"
+        inner.mkdir()
+        for name in ("a", "b"):
+            (inner / name).symlink_to(f"../level{level + 1}")
+    (folder / "level30").mkdir()
+
+    with pytest.raises(InputError, match=r"at most 100 folders, found more; do links lead"):
+        the_tree(folder)
 
 
 @pytest.mark.parametrize("target", ["/etc/hostname", "../outside.txt", "gone.txt"])
