@@ -13,6 +13,7 @@ from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.models.machine_facts import MachineFacts
 from cosmos_cli.onboard.facts import _file
 from cosmos_cli.onboard.files import replace_file
+from cosmos_cli.provision.desired import questions
 from cosmos_cli.provision.gather_facts import gather_facts
 from cosmos_cli.provision.step import Kind, Step
 from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, notes_of, plan_steps
@@ -209,6 +210,24 @@ def test_wheels_that_are_there_take_no_room():
 
     assert step.size_bytes == ENVIRONMENT_BYTES // 2
     check_possible(facts_of(disk={"free_bytes": ENVIRONMENT_BYTES}), (step,))
+
+
+@pytest.mark.parametrize("kind", ["file", "line"])
+def test_unit_is_read_by_systemd_in_the_step_that_writes_it(kind):
+    """So that a cut between both leaves the step undone, or what was written is told as not read."""
+    path = "/etc/systemd/system/a.service"
+    action = (
+        {"file": {"dest": path, "content": "[Service]\n"}}
+        if kind == "file"
+        else {"line": {"path": path, "line": "[Service]", "create": True}}
+    )
+    wants = wanted(provision=(action,))
+
+    (step,) = plan_steps(facts_of(), wants)
+
+    assert [request.verb for request in step.requests][1:] == ["service"]
+    assert step.requests[1].arguments["reload"] and step.requests[1].as_root
+    assert questions(wants)["units"] == ["a.service"]
 
 
 def test_what_was_sent_before_needs_no_room_again():
