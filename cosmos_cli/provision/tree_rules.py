@@ -1,5 +1,5 @@
 """
-What of a scenario's folder belongs to a tree: its files, but for what is hidden, caches, environments and runs.
+Rules of what in a scenario's folder belongs to a tree: its files, but for what is hidden, caches, environments and runs.
 
 The same rules hold for what machines are sent, for a run's copy of what it flies and for where tests are looked for.
 """

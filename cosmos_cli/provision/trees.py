@@ -38,7 +38,7 @@ BATCH_BYTES = 4 * 1024 * 1024
 COMPRESSION_LEVEL = 6
 SAMPLE_BYTES = 65_536
 DENSE_SHARE = 0.9
-"""What compression leaves at least so much of is sent as it is: every machine's copy costs processor time here."""
+"""Share of its size that content keeps when it is sent as it is: each machine's copy costs processor time here."""
 ROUNDS_MAX = 3
 """Another operator who assembles the same tree at the same time may take what was just sent."""
 ASSEMBLE_TIMEOUT_S = 120.0
