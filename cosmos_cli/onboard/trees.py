@@ -69,6 +69,7 @@ def _blobs_folder(trees_folder: str) -> Iterator[str]:
     folder = os.path.join(content_store.expand(trees_folder), content_store.BLOBS)
     try:
         os.makedirs(folder, exist_ok=True)
+        os.utime(folder)  # pieces of one file alone would leave it as old as the first
         yield folder
     except OSError:
         _drop(folder)

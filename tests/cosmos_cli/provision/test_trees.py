@@ -383,6 +383,16 @@ def test_piece_that_does_not_follow_is_refused(machine):
     assert [p for p in Path(machine.layout.trees).rglob("*") if p.is_file()] == []
 
 
+def test_piece_keeps_what_was_sent_young(tmp_path):
+    """A large file over a slow link takes longer than what nobody has touched is kept."""
+    how = {"folder": str(tmp_path), "sha256": "0" * 64, "size": 9, "length": 4}
+    for offset in (0, 4):
+        given = VerbRequest(arguments={**how, "offset": offset}, body=zlib.compress(b"text"))
+        onboard_trees.blob(given)
+        assert (tmp_path / ".blobs").stat().st_mtime > 1
+        os.utime(tmp_path / ".blobs", (1, 1))
+
+
 def test_large_file_that_changes_while_it_is_sent_is_told(folder, machine, monkeypatch):
     monkeypatch.setattr(trees, "BATCH_BYTES", 1000)
     (folder / "data.bin").write_bytes(os.urandom(2500))
