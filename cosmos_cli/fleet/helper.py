@@ -31,6 +31,7 @@ from cosmos_cli.fleet.failure import EndedEarly, FailureKind, MachineFailure, ru
 from cosmos_cli.fleet.liveness import BlockingStream, SilenceWatch, SilentMachine
 from cosmos_cli.fleet.shell import NO_PYTHON_HOME, SYSTEM_PATH, for_login_shell
 from cosmos_cli.fleet.transfer_limits import Patience, duration_words
+from cosmos_cli.onboard.request_loop import SUDO_TIMEOUT_S
 from cosmos_cli.ui.step_times import timed
 
 PARTS = "cosmos_cli.onboard"
@@ -38,6 +39,8 @@ PYTHON_NEEDED = (3, 11)
 PYTHONS = ("python3", "python3.13", "python3.12", "python3.11", "/usr/bin/python3")
 START_TIMEOUT_S = 20.0
 CALL_TIMEOUT_S = 30.0
+ROOT_START_S = 2 * SUDO_TIMEOUT_S + 5.0
+"""The machine asks sudo twice, and tells itself when that takes too long."""
 WHOLE_TIMEOUT_S = 3600.0
 """Time for an answer in pieces, beside what its bytes are worth."""
 
@@ -111,6 +114,7 @@ class Helper:
         self._link = BlockingStream(stream, watch)
         self._answers = AnswerReader(self._link)
         self._is_out_of_step = False
+        self._is_root_asked = False
         self.machine = ""
         """Name of the machine; empty for a helper that was not started by `start`."""
         self.greeting: Mapping[str, Any] = {}
@@ -190,8 +194,10 @@ class Helper:
             MachineFailure: It was refused, or the connection is lost, or *timeout_s* is over.
         """
         with timed(self.machine, f"ask: {verb}", level=2):
+            start_s = self._root_start_s(as_root=as_root)
             self._ask(verb, arguments, body, as_root=as_root, timeout_s=timeout_s)
-            header, body = self._read_answer(_expected(verb, arguments), timeout_s=timeout_s)
+            expected = _expected(verb, arguments)
+            header, body = self._read_answer(expected, timeout_s=timeout_s + start_s)
         return Answer(value=header["value"], body=body)
 
     def parts(
@@ -217,11 +223,13 @@ class Helper:
             MachineFailure: As `call`.
         """
         with timed(self.machine, f"ask: {verb}", level=2):
+            start_s = self._root_start_s(as_root=as_root)
             self._ask(verb, arguments, b"", as_root=as_root, timeout_s=timeout_s)
             expected = dataclasses.replace(_expected(verb, arguments), is_streamed=True)
             patience = Patience(whole_s)
             while True:
-                header, body = self._read_answer(expected, timeout_s=timeout_s)
+                header, body = self._read_answer(expected, timeout_s=timeout_s + start_s)
+                start_s = 0.0
                 if not header.get("part"):
                     return
                 patience.moved(len(body))
@@ -240,6 +248,13 @@ class Helper:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    def _root_start_s(self, *, as_root: bool) -> float:
+        """Return how much longer the first answer of root may take: sudo, which may be slow, comes before it."""
+        if not as_root or self._is_root_asked or self.greeting.get("uid") == 0:
+            return 0.0
+        self._is_root_asked = True
+        return ROOT_START_S
 
     def _ask(
         self,

@@ -27,7 +27,7 @@ from cosmos_cli.evidence.flown_files import (
     fault_of_name,
 )
 from cosmos_cli.evidence.run_directory import RunDirectory
-from cosmos_cli.provision.trees import is_folder_of_tree, is_name_of_tree
+from cosmos_cli.provision.tree_rules import is_folder_of_tree, is_link_of_no_tree, is_name_of_tree
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.bounded_files import open_regular_file, read_regular_file
 from madns_runtime.recording.access import Access, file_mode, folder_mode
@@ -175,7 +175,7 @@ def _kind(entry: os.DirEntry[str], path: Path, top: Path) -> str:
     Raises:
         OSError: It cannot be looked at.
     """
-    if not is_name_of_tree(entry.name):
+    if not is_name_of_tree(entry.name) or (entry.is_symlink() and is_link_of_no_tree(path)):
         return ""
     if entry.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(top):
         return "a link that leads out of the folder"

@@ -161,6 +161,8 @@ class MachineFacts:
     """Words of sudo on a user who may not; empty where it says nothing."""
     files: Mapping[str, FileFact] = field(default_factory=dict)
     services: Mapping[str, ServiceFact] = field(default_factory=dict)
+    stale_units: frozenset[str] = frozenset()
+    """Of the units that were asked for: those whose files systemd has not read since they were changed."""
     packages: Mapping[str, str | None] = field(default_factory=dict)
     """Version of each package that was asked for; None when it is not installed."""
     conditions: Mapping[str, bool | None] = field(default_factory=dict)
@@ -170,11 +172,13 @@ class MachineFacts:
     environments: frozenset[str] = frozenset()
     """Keys of wanted environments that are there, whole and unchanged."""
     prunable: tuple[str, ...] = ()
-    """Trees, environments and wheels that nobody uses, such as trees/<hash>."""
+    """Trees, environments and wheels that nobody uses, such as trees/<hash>, and what was left half made."""
     prunable_bytes: int = 0
     """Room that these take on the disk, at least."""
     wheels: frozenset[str] = frozenset()
     """Names of the dist-info folders of wheels that are there, if a wanted environment is not."""
+    blobs: frozenset[str] = frozenset()
+    """Hashes of files that were sent there and belong to no tree yet, if a wanted tree is not there."""
 
     @classmethod
     def from_mapping(
@@ -233,6 +237,7 @@ class MachineFacts:
             files=files_of(told),
             packages=dict(told.get("packages") or {}),
             services={k: ServiceFact(**v) for k, v in (told.get("services") or {}).items()},
+            stale_units=frozenset(told.get("stale_units") or ()),
             conditions=dict(told.get("conditions") or {}),
         )
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import time
 from collections.abc import Iterable, Iterator, Mapping
 
 from cosmos_cli.onboard.request_loop import PlainValue, sha256
@@ -17,8 +18,14 @@ from cosmos_cli.onboard.request_loop import PlainValue, sha256
 MARK = ".complete"
 HIDDEN = "."
 """First character of things half made, or on their way out; nothing else may have it."""
+BLOBS = ".blobs"
+"""In the folder of trees: files that were sent and belong to no tree yet, by their hash."""
+LEFT_OVER_S = 3600.0
+"""A half-made thing that nobody has touched for so long has no maker any more."""
 NOT_SEEN = (FileNotFoundError, ProcessLookupError, PermissionError)
 """Errors by which /proc tells that a process has ended, or is another user's."""
+_BEGAN_S = time.clock_gettime(time.CLOCK_REALTIME) - time.clock_gettime(time.CLOCK_BOOTTIME)
+"""When the machine was started, by the wall clock as this process found it."""
 
 
 def expand(path: str) -> str:
@@ -78,6 +85,30 @@ def names_in(folder: str) -> list[str]:
         return sorted(name for name in os.listdir(folder) if not name.startswith(HIDDEN))
     except FileNotFoundError:
         return []
+
+
+def left_overs(folder: str) -> list[str]:
+    """
+    Return the names of what was left half made, or half removed, in a folder by makers that are gone.
+
+    A wall clock that is set meanwhile, as by a time service on a board without a clock of its own, makes nothing old
+    that is not: it counts as old only by the clock of now and by the one that this process found as it began.
+    """
+    elapsed_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    now_s = min(_BEGAN_S + elapsed_s, time.clock_gettime(time.CLOCK_REALTIME))
+    changed_s = changes_of_hidden(folder).items()
+    return sorted(name for name, when_s in changed_s if now_s - when_s > LEFT_OVER_S)
+
+
+def changes_of_hidden(folder: str) -> dict[str, float]:
+    """Return when each thing half made in a folder was changed last, s since 1970, by its name."""
+    found = {}
+    with contextlib.suppress(FileNotFoundError):
+        for name in os.listdir(folder):
+            if name.startswith(HIDDEN):
+                with contextlib.suppress(OSError):
+                    found[name] = os.lstat(os.path.join(folder, name)).st_mtime
+    return found
 
 
 def used(paths: Iterable[str]) -> set[str]:

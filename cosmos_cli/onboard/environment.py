@@ -292,7 +292,7 @@ def versions(request: VerbRequest) -> dict[str, str | None]:
 
 @verb("prune_installed")
 def prune_installed(request: VerbRequest) -> dict[str, PlainValue]:
-    """Remove the trees, environments and wheels that nobody needs, and what Python compiled of them."""
+    """Remove the trees, environments and wheels that nobody needs, what was left half made, and what Python compiled of them."""
     asked = request.arguments
     folders = {kind: content_store.expand(path) for kind, path in asked["folders"].items()}
     wanted = {"trees": asked["trees"], "environments": asked["environments"]}
@@ -300,8 +300,6 @@ def prune_installed(request: VerbRequest) -> dict[str, PlainValue]:
     for kind, names in removed.items():
         for name in names:
             content_changes.remove(os.path.join(folders[kind], name))
-    for folder in folders.values():
-        content_changes.remove_left_overs(folder)
     for kind in wanted:
         # Python put what it compiled below that folder under the whole path of the source.
         compiled = content_store.expand(asked["compiled"]) + folders[kind]

@@ -97,6 +97,7 @@ def facts(request: VerbRequest) -> dict[str, PlainValue]:
         "radios": _radios(sys_),
         "uses_pam": _uses_pam(etc) if asked.get("is_pam_asked") else None,
         "services": {name: service_state(name) for name in asked.get("services") or ()},
+        "stale_units": [name for name in asked.get("units") or () if _is_stale(name)],
         **look(request),
         "packages": installed_versions(asked.get("packages") or (), _output),
         **(_end_sudo(sudo) if is_sudo_asked else {"sudo": None, "sudo_refusal": None}),
@@ -319,11 +320,17 @@ def service_state(name: str) -> dict[str, str]:
     }
 
 
+def _is_stale(unit: str) -> bool:
+    """Tell whether a unit's files were changed since systemd read them."""
+    said = _output(["systemctl", "show", "-p", "NeedDaemonReload", unit], TOOL_TIMEOUT_S)
+    return said.strip() == "NeedDaemonReload=yes"
+
+
 def _condition(condition: Mapping[str, PlainValue]) -> bool | None:
     """Tell whether a command is done already; None when only root can say."""
     path = condition.get("creates")
     if path is None:
-        return is_done(condition["unless"], as_root=bool(condition.get("root")))
+        return _is_done(condition["unless"], as_root=bool(condition.get("root")))
     try:
         os.lstat(os.path.expanduser(path))
     except PermissionError:
@@ -333,17 +340,22 @@ def _condition(condition: Mapping[str, PlainValue]) -> bool | None:
     return True
 
 
-def is_done(unless: str, *, as_root: bool) -> bool:
+def _is_done(unless: str, *, as_root: bool) -> bool:
     """Tell whether a command's condition succeeds; one that may not be asked as root does not."""
-    shell = [
-        "timeout",
-        f"{CONDITION_TIMEOUT_S:g}",
-        "/bin/sh",
-        "-c",
-        f"exec >/dev/null 2>&1; {unless}",
-    ]
+    shell = condition_command(unless)
     command = ["sudo", "-n", *shell] if as_root and os.geteuid() != 0 else shell
     status, _ = _run(command, CONDITION_TIMEOUT_S + TOOL_TIMEOUT_S, {})
+    return condition_holds(unless, status)
+
+
+def condition_command(unless: str) -> list[str]:
+    """Return the command that asks a condition, and ends by itself; `condition_holds` reads its exit status."""
+    shell = ["/bin/sh", "-c", f"exec >/dev/null 2>&1; {unless}"]
+    return ["timeout", f"{CONDITION_TIMEOUT_S:g}", *shell]
+
+
+def condition_holds(unless: str, status: int | None) -> bool:
+    """Tell whether a condition holds, None for one that could not be asked; one that took too long is refused."""
     if status == TIMED_OUT_STATUS:
         raise HelperRefusal("timeout", f"unless: {unless}: not done in {CONDITION_TIMEOUT_S:g} s")
     return status == 0
@@ -353,7 +365,7 @@ def _start_sudo() -> subprocess.Popen[bytes] | None:
     """Ask whether this user may become root, and go on meanwhile; None for root itself."""
     if os.geteuid() == 0:
         return None
-    import subprocess  # as in is_done
+    import subprocess  # as in _run
 
     with contextlib.suppress(OSError):
         return subprocess.Popen(

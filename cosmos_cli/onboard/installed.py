@@ -51,6 +51,8 @@ def installed(request: VerbRequest) -> dict[str, PlainValue]:
     going = prunable(folders, wanted)
     is_any_missing = not all(told["environments"].values())
     told["wheels"] = wheels_there(folders["wheels"], going["wheels"]) if is_any_missing else []
+    is_any_missing = not all(told["trees"].values())
+    told["blobs"] = blobs_there(folders["trees"], going["trees"]) if is_any_missing else []
     paths = [os.path.join(folders[kind], name) for kind, names in going.items() for name in names]
     return {**told, "prunable": going, "prunable_bytes": freed_bytes(paths)}
 
@@ -176,7 +178,7 @@ def site_folder(python: Sequence[int]) -> str:
 
 
 def prunable(folders: Mapping[str, str], wanted: Mapping[str, PlainValue]) -> dict[str, list[str]]:
-    """Return what no living run uses, nobody asks for, and is not among the newest."""
+    """Return what no living run uses, nobody asks for, and is not among the newest; what was left half made as well."""
     found: dict[str, list[str]] = {}
     for kind, names in wanted.items():
         rest = [
@@ -190,7 +192,7 @@ def prunable(folders: Mapping[str, str], wanted: Mapping[str, PlainValue]) -> di
         in_use = content_store.used(rest)
         found[kind] = [os.path.basename(path) for path in rest if path not in in_use]
     found["wheels"] = _orphans(folders, found["environments"])
-    return found
+    return {kind: names + content_store.left_overs(folders[kind]) for kind, names in found.items()}
 
 
 def wheels_there(folder: str, going: Sequence[str]) -> list[str]:
@@ -198,6 +200,13 @@ def wheels_there(folder: str, going: Sequence[str]) -> list[str]:
     names = (name for name in content_store.names_in(folder) if name not in going)
     marks = (content_store.read_mark(os.path.join(folder, name)) or {} for name in names)
     return sorted({str(mark["info"]) for mark in marks if mark.get("info")})
+
+
+def blobs_there(folder: str, going: Sequence[str]) -> list[str]:
+    """Return the hashes of files that were sent and stay: a tree of them takes no room for these."""
+    if content_store.BLOBS in going:
+        return []
+    return content_store.names_in(os.path.join(folder, content_store.BLOBS))
 
 
 def freed_bytes(paths: Sequence[str]) -> int:

@@ -34,9 +34,6 @@ HEADER_BYTES_MAX = 64 * 1024 * 1024
 BODY_BYTES_MAX = 1024 * 1024 * 1024
 LAST_WORDS_BYTES = 4000
 SUDO_TIMEOUT_S = 20.0
-SLOW_SUDO_ADVICE = (
-    "does it wait for a name server? /etc/hosts there should have the machine's own name"
-)
 LOCK_PATIENCE_S = 60.0
 """Without a question for so long the machine's lock is given up: the operator is gone."""
 
@@ -98,12 +95,7 @@ def verb(name: str) -> Callable[[Handler], Handler]:
 
 
 def handler_of(name: str) -> Handler:
-    """
-    Return the handler of a verb; its module is loaded now, if it is not yet.
-
-    Raises:
-        Refusal: There is none.
-    """
+    """Return the handler of a verb, whose module is loaded now if it is not yet; one that is not known is refused."""
     if name not in VERBS and name in WHERE:
         __import__(WHERE[name])
     if name not in VERBS:
@@ -200,8 +192,7 @@ class Rooted:
         except FileNotFoundError:
             raise no_sudo("there is no sudo") from None
         except subprocess.TimeoutExpired:  # what runs as root cannot be killed from here
-            text = f"sudo -n true has not ended in {SUDO_TIMEOUT_S:g} s"
-            raise HelperRefusal("timeout", text, SLOW_SUDO_ADVICE) from None
+            raise slow_sudo("sudo -n true has not ended") from None
         if asked.returncode:
             raise no_sudo(said.decode(errors="replace").strip() or "sudo refused")
         process = subprocess.Popen(
@@ -210,15 +201,23 @@ class Rooted:
             stdout=subprocess.PIPE,
             start_new_session=True,
         )
-        assert process.stdin is not None
+        assert process.stdin is not None and process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
             process.stdin.write(self._package)
             process.stdin.flush()
-        assert process.stdout is not None
+        if not select.select([process.stdout], [], [], SUDO_TIMEOUT_S)[0]:
+            process.stdin.close()
+            raise slow_sudo("sudo -n has started nothing")
         if read_frame(process.stdout) is None:
             raise HelperRefusal("lost", "what runs there as root ended before it began")
         self._process = process
         return process
+
+
+def slow_sudo(what: str) -> HelperRefusal:
+    """Return the refusal of a machine whose sudo takes too long."""
+    advice = "does it wait for a name server? /etc/hosts there should have the machine's own name"
+    return HelperRefusal("timeout", f"{what} in {SUDO_TIMEOUT_S:g} s", advice)
 
 
 def no_sudo(said: str) -> HelperRefusal:

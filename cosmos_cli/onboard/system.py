@@ -12,9 +12,15 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 
-from cosmos_cli.onboard.facts import is_done, service_state
+from cosmos_cli.onboard.facts import (
+    CONDITION_TIMEOUT_S,
+    TOOL_TIMEOUT_S,
+    condition_command,
+    condition_holds,
+    service_state,
+)
 from cosmos_cli.onboard.request_loop import (
     AnswerPart,
     HelperRefusal,
@@ -110,19 +116,27 @@ def command(request: VerbRequest) -> Iterator[AnswerPart]:
     The last part tells whether it "ran", and "notes": that its own condition does not hold even then.
     """
     asked = request.arguments
-    if _is_done(asked):
+    if (yield from _is_done(asked)):
         yield AnswerPart(value={"ran": False})
         return
     yield from _succeeding(["/bin/sh", "-c", asked["run"]], timeout_s=asked["timeout_s"])
     condition = "creates" if asked.get("creates") else "unless"
-    notes = [] if _is_done(asked) else [NOT_DONE.format(condition)]
+    is_done_now = yield from _is_done(asked)
+    notes = [] if is_done_now else [NOT_DONE.format(condition)]
     yield AnswerPart(value={"ran": True, "notes": notes})
 
 
-def _is_done(asked: Mapping[str, PlainValue]) -> bool:
+def _is_done(asked: Mapping[str, PlainValue]) -> Generator[AnswerPart, None, bool]:
+    """Return whether a command's condition holds, with signs of life while it is asked."""
     if asked.get("creates"):
         return os.path.lexists(os.path.expanduser(asked["creates"]))
-    return is_done(asked["unless"], as_root=False)
+    status = None
+    ask, limit_s = condition_command(asked["unless"]), CONDITION_TIMEOUT_S + TOOL_TIMEOUT_S
+    for part in running(ask, timeout_s=limit_s):
+        status = part.value.get("exit_status")
+        if status is None:
+            yield part
+    return condition_holds(asked["unless"], status)
 
 
 def _succeeding(

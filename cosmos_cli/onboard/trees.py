@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import os
+import shutil
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 
 from cosmos_cli.onboard import content_changes, content_store
 from cosmos_cli.onboard.installed import files_of_tree, hash_of_tree, is_tree_whole, traces_of_tree
@@ -19,26 +21,68 @@ from cosmos_cli.onboard.request_loop import (
     HelperRefusal,
     PlainValue,
     VerbRequest,
+    no_links,
     sync_folder,
     verb,
 )
 
-BLOBS = ".blobs"
-"""Files that were sent and belong to no tree yet, by their hash."""
 MARK_SCHEMA = 1
+PART = ".part"
 
 
 @verb("blobs")
 def blobs(request: VerbRequest) -> None:
     """Keep files that were sent; a tree will be made of them."""
-    folder = os.path.join(content_store.expand(request.arguments["folder"]), BLOBS)
-    os.makedirs(folder, exist_ok=True)
-    content = memoryview(_unpacked(request))
-    for sha256, size in request.arguments["blobs"]:
-        blob, content = content[:size], content[size:]
-        if hashlib.sha256(blob).hexdigest() != sha256:
-            raise HelperRefusal("data", "a file that was sent is not what was announced", "repeat")
-        content_changes.write_whole(os.path.join(folder, sha256), bytes(blob), is_durable=False)
+    asked = request.arguments
+    content = memoryview(_unpacked(request.body, sum(size for _, size in asked["blobs"])))
+    with _blobs_folder(asked["folder"]) as folder:
+        for sha256, size in asked["blobs"]:
+            blob, content = content[:size], content[size:]
+            if hashlib.sha256(blob).hexdigest() != sha256:
+                raise _not_announced()
+            content_changes.write_whole(os.path.join(folder, sha256), bytes(blob), is_durable=False)
+
+
+@verb("blob")
+def blob(request: VerbRequest) -> None:
+    """Keep a piece of a large file that is sent; with the last one it is verified and gets its name."""
+    asked = request.arguments
+    piece = _unpacked(request.body, asked["length"])
+    with _blobs_folder(asked["folder"]) as folder:
+        partial = os.path.join(folder, f"{content_store.HIDDEN}{asked['sha256']}{PART}")
+        with open(partial, "ab" if asked["offset"] else "wb", opener=no_links) as file:
+            if file.tell() != asked["offset"]:
+                text = f"{partial}: expected {asked['offset']} B, has {file.tell()} B"
+                raise HelperRefusal("data", text, "repeat")
+            file.write(piece)
+        if asked["offset"] + len(piece) < asked["size"]:
+            return
+        if content_store.hash_of(partial) != asked["sha256"]:
+            os.unlink(partial)
+            raise _not_announced()
+        os.replace(partial, os.path.join(folder, asked["sha256"]))
+
+
+@contextlib.contextmanager
+def _blobs_folder(trees_folder: str) -> Iterator[str]:
+    """Give the folder of what was sent; it goes when it cannot be written: a full disk needs the room more."""
+    folder = os.path.join(content_store.expand(trees_folder), content_store.BLOBS)
+    try:
+        os.makedirs(folder, exist_ok=True)
+        os.utime(folder)  # pieces of one file alone would leave it as old as the first
+        yield folder
+    except OSError:
+        _drop(folder)
+        raise
+
+
+def _drop(blobs_folder: str) -> None:
+    with contextlib.suppress(OSError):
+        content_changes.remove(blobs_folder)
+
+
+def _not_announced() -> HelperRefusal:
+    return HelperRefusal("data", "a file that was sent is not what was announced", "repeat")
 
 
 @verb("tree")
@@ -50,69 +94,92 @@ def tree(request: VerbRequest) -> dict[str, PlainValue]:
     """
     asked = request.arguments
     folder = content_store.expand(asked["folder"])
-    if is_tree_whole(os.path.join(folder, asked["hash"])):
+    path = os.path.join(folder, asked["hash"])
+    if is_tree_whole(path):
         return {"changed": False, "missing": []}
     os.makedirs(folder, exist_ok=True)
-    content_changes.remove_left_overs(folder)
-    new = content_changes.beside(folder, asked["hash"])
-    try:
-        missing = _assemble(new, folder, asked["files"])
-        if missing:
+    with _alone_in(folder):
+        if is_tree_whole(path):  # another operator was quicker
+            return {"changed": False, "missing": []}
+        content_changes.remove_left_overs(folder)
+        sources = _verified(folder, [sha256 for _, sha256, _ in asked["files"]])
+        if None in sources.values():
+            missing = [sha256 for sha256, source in sources.items() if source is None]
             return {"changed": False, "missing": missing}
-        _settle(new, folder, asked)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            content_changes.remove(new)
+        new = content_changes.beside(folder, asked["hash"])
+        try:
+            _assemble(new, asked["files"], sources)
+            _settle(new, folder, asked)
+        except OSError:
+            _drop(os.path.join(folder, content_store.BLOBS))
+            raise
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                content_changes.remove(new)
     return {"changed": True, "missing": []}
 
 
-def _assemble(new: str, folder: str, files: list[list[PlainValue]]) -> list[str]:
-    """Make a folder of files that are somewhere here; return the hashes of those that are not."""
-    sources = _sources(folder)
-    missing: dict[str, None] = {}
-    os.mkdir(new)
-    for name, sha256, mode in files:
-        if sha256 in missing:
-            continue
-        content = _content(sha256, sources.get(sha256, ()))
-        if content is None:
-            missing[sha256] = None
-        elif not missing:
-            _put(new, name, mode, content)
-    return list(missing)
+@contextlib.contextmanager
+def _alone_in(folder: str) -> Iterator[None]:
+    """Wait until nobody else assembles a tree here: what was sent is moved into one, and may be in another as well."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
-def _sources(folder: str) -> dict[str, list[str]]:
-    """Return where each content is: in what was sent, or in another tree."""
-    sources: dict[str, list[str]] = {}
-    sent = os.path.join(folder, BLOBS)
-    for sha256 in content_store.names_in(sent):
-        sources.setdefault(sha256, []).append(os.path.join(sent, sha256))
+def _verified(folder: str, wanted: list[str]) -> dict[str, str | None]:
+    """Return where each wanted content is: in what was sent, or in another tree; None of one that is not here."""
+    places: dict[str, list[str]] = {sha256: [] for sha256 in wanted}
+    sent = os.path.join(folder, content_store.BLOBS)
+    for sha256 in places.keys() & content_store.names_in(sent):
+        places[sha256].append(os.path.join(sent, sha256))
     for tree_hash in content_store.names_in(folder):
         path = os.path.join(folder, tree_hash)
         mark = content_store.read_mark(path) or {}
         for name, sha256 in mark.get("files", {}).items():
-            sources.setdefault(sha256, []).append(os.path.join(path, name))
-    return sources
+            if sha256 in places:
+                places[sha256].append(os.path.join(path, name))
+    return {sha256: _first_whole(sha256, paths) for sha256, paths in places.items()}
 
 
-def _content(sha256: str, paths: Iterable[str]) -> bytes | None:
+def _first_whole(sha256: str, paths: list[str]) -> str | None:
     for path in paths:
-        with contextlib.suppress(OSError), open(path, "rb") as file:
-            content = file.read()
-            if hashlib.sha256(content).hexdigest() == sha256:
-                return content
+        with contextlib.suppress(OSError):
+            if content_store.hash_of(path) == sha256:
+                return path
     return None
 
 
-def _put(top: str, name: str, mode: int, content: bytes) -> None:
+def _assemble(new: str, files: list[list[PlainValue]], sources: Mapping[str, str | None]) -> None:
+    """
+    Make a folder of files that are here.
+
+    What was sent is moved, so that a tree never needs twice its room. What another tree has is copied: a second name
+    would change the time of a file there, by which both would be read again at every look.
+    """
+    sent = os.path.join(os.path.dirname(new), content_store.BLOBS)
+    os.mkdir(new)
+    moved: dict[str, str] = {}
+    for name, sha256, mode in files:
+        path = _path_within(new, name)
+        os.makedirs(os.path.dirname(path), exist_ok=True)
+        source = moved.get(sha256) or str(sources[sha256])
+        if os.path.dirname(source) == sent:
+            os.rename(source, path)
+            moved[sha256] = path
+        else:
+            shutil.copyfile(source, path)
+        os.chmod(path, mode)  # whatever the umask is here
+
+
+def _path_within(top: str, name: str) -> str:
     parts = name.split("/")
     if not all(parts) or {".", ".."} & set(parts):
         raise HelperRefusal("data", f"{name!r}: expected a path within the tree")
-    path = os.path.join(top, name)
-    os.makedirs(os.path.dirname(path), exist_ok=True)
-    content_changes.write_new(path, content, mode)
-    os.chmod(path, mode)  # whatever the umask is here
+    return os.path.join(top, name)
 
 
 def _settle(new: str, folder: str, asked: Mapping[str, PlainValue]) -> None:
@@ -129,9 +196,6 @@ def _settle(new: str, folder: str, asked: Mapping[str, PlainValue]) -> None:
     content_changes.mark_complete(new, {**mark, "traces": traces_of_tree(new)})
     _take_place(new, os.path.join(folder, asked["hash"]), asked["label"])
     sync_folder(folder)
-    for sha256 in set(files.values()):
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(os.path.join(folder, BLOBS, sha256))
 
 
 def _take_place(new: str, path: str, label: str) -> None:
@@ -148,11 +212,10 @@ def _take_place(new: str, path: str, label: str) -> None:
             raise HelperRefusal("busy", f"{label}: another command works on it", "repeat") from None
 
 
-def _unpacked(request: VerbRequest) -> bytes:
-    size = sum(size for _, size in request.arguments["blobs"])
+def _unpacked(body: bytes, size: int) -> bytes:
     unpacker = zlib.decompressobj()
     try:
-        content = unpacker.decompress(request.body, size + 1)
+        content = unpacker.decompress(body, size + 1)
     except zlib.error as error:
         raise HelperRefusal(
             "data", f"what was sent cannot be unpacked: {error}", "repeat"

@@ -8,7 +8,7 @@ From bare machines to ready ones, idempotently.
     up             these four in order, under a machine's lock, and what became of it; on all machines of a fleet
 
 `wheelhouse`, `resolver`, `lock` and `wheels` bring environments to machines without internet; `trees` are code by the
-hash of its content. `desired`, `steps`, `settings` and `inventory_steps` are pure.
+hash of its content, and `tree_rules` tell what belongs to one. `desired`, `steps`, `settings` and `inventory_steps` are pure.
 """
 
 STORE_PARTS = (

@@ -124,7 +124,7 @@ def make_ready(
         is_host: Whether the host runs there.
 
     Raises:
-        MachineFailure: Its environment is not there or damaged; the advice is the command that makes it.
+        MachineFailure: Its environment is not there or damaged, the advice is the command that makes it; or as `send_tree`.
     """
     layout = Layout(at_home(target.root, str(helper.greeting["home"])))
     key = environment_key_of(helper, cargo, machine, is_host=is_host)
@@ -138,17 +138,18 @@ def make_ready(
             touch=True,
         ),
     )
+    machines = invocation.current().machine_options
+    as_host = f" --host {target.name}" if is_host else ""
+    up = f"`cosmos up{machines}{as_host} {shlex.quote(cargo.scenario_path)}`"
     if not found.environments[key]:
-        machines = invocation.current().machine_options
-        as_host = f" --host {target.name}" if is_host else ""
         raise MachineFailure(
             FailureKind.STEP,
             "the Python packages that the run needs are not installed there, or no longer whole",
-            f"run `cosmos up{machines}{as_host} {shlex.quote(cargo.scenario_path)}` first",
+            f"run {up} first",
         )
     for tree in trees:
         if not found.trees[tree.hash]:
-            send_tree(helper, layout, tree)
+            _send(helper, layout, tree, up)
     drivers = cargo.drivers.get(target.name)
     return Ready(
         python=layout.python(key),
@@ -156,6 +157,17 @@ def make_ready(
         base_directory=layout.tree(cargo.scenario.hash),
         driver_directory=drivers.directory(layout.tree(drivers.tree.hash)) if drivers else "",
     )
+
+
+def _send(helper: Helper, layout: Layout, tree: Tree, up: str) -> None:
+    """Send a tree; where no room is left for it, the advice is the command that makes some."""
+    try:
+        send_tree(helper, layout, tree)
+    except MachineFailure as failure:
+        if failure.kind is not FailureKind.DISK_FULL:
+            raise
+        advice = f"run {up}, which removes code of earlier runs there, or make room"
+        raise MachineFailure(failure.kind, f"{tree.label}: {failure.text}", advice) from None
 
 
 def environment_key_of(

@@ -13,7 +13,7 @@ from cosmos_cli.models.inventory import Variables
 from cosmos_cli.models.inventory.settings import setting_files
 from cosmos_cli.models.machine_facts import SystemPaths, condition_key
 from cosmos_cli.provision.device_steps import membership
-from cosmos_cli.provision.inventory_steps import Content, DeclaredStep, declared_step
+from cosmos_cli.provision.inventory_steps import Content, DeclaredStep, declared_step, unit_of
 from cosmos_cli.provision.trees import Tree
 from cosmos_cli.provision.wheelhouse import Environment
 
@@ -129,6 +129,7 @@ def questions(desired: DesiredState, *, has_texts: bool = False) -> dict[str, An
         "services": sorted(
             {d.step.service.name for d in desired.declared if d.step.service is not None}
         ),
+        "units": sorted({unit for d in desired.declared if (unit := unit_of(d.path))}),
         "conditions": {
             condition_key(condition): condition
             for condition in (

@@ -10,7 +10,8 @@ from pathlib import Path
 from cosmos_cli.errors import InputError
 from cosmos_cli.models.device_needs import MachineNeeds
 from cosmos_cli.models.inventory import Machine
-from cosmos_cli.provision.trees import FILES_MAX, Tree, entries_in, read_tree_file, tree_of
+from cosmos_cli.provision.tree_rules import entries_in
+from cosmos_cli.provision.trees import FILES_MAX, Tree, read_tree_file, tree_of
 
 PACKAGE_MARK = "__init__.py"
 

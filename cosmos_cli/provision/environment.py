@@ -7,7 +7,7 @@ The operator's side of `cosmos_cli.onboard.environment`, `.installed` and `.runt
 from __future__ import annotations
 
 import mmap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -260,29 +260,35 @@ def _send_wheels(
     whole_bytes = sum(wheel.locked.size_bytes - have for wheel, have in wheels)
     sent_bytes = 0
     for wheel, have in wheels:
-        locked = wheel.locked
-        see_verified(wheel.path, locked)
-        arguments = {
-            "folder": layout.wheels,
-            "sha256": locked.sha256,
-            "filename": locked.filename,
-            "size": locked.size_bytes,
-            "is_verified": wheel.is_verified,
-        }
-        with (
-            wheel.path.open("rb") as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-        ):
-            offsets = range(have, locked.size_bytes, PIECE_BYTES)
-            for offset in offsets or [
-                have
-            ]:  # all of it may have come, before the connection was cut
-                piece = content[offset : offset + PIECE_BYTES]
-                helper.call(
-                    "wheel",
-                    {**arguments, "offset": offset},
-                    body=piece,
-                    timeout_s=BUILD_TIMEOUT_S,
-                )
-                sent_bytes += len(piece)
+        see_verified(wheel.path, wheel.locked)
+        try:
+            for piece_bytes in _send_wheel(helper, layout, wheel, have):
+                sent_bytes += piece_bytes
                 progress(f"wheels {sent_bytes / 1e6:.1f} MB", sent_bytes / max(1, whole_bytes))
+        except MachineFailure as failure:
+            if failure.kind is not FailureKind.DATA or not have:
+                raise
+            for _ in _send_wheel(helper, layout, wheel, 0):
+                pass  # what had come before is not its beginning, as after a power cut
+
+
+def _send_wheel(helper: Helper, layout: Layout, wheel: SentWheel, have: int) -> Iterator[int]:
+    """Send a wheel from byte *have* on; yield the size of each piece."""
+    arguments = {
+        "folder": layout.wheels,
+        "sha256": wheel.locked.sha256,
+        "filename": wheel.locked.filename,
+        "size": wheel.locked.size_bytes,
+        "is_verified": wheel.is_verified,
+    }
+    with (
+        wheel.path.open("rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+    ):
+        # All of it may have come, before the connection was cut.
+        for offset in range(have, wheel.locked.size_bytes, PIECE_BYTES) or [have]:
+            piece = content[offset : offset + PIECE_BYTES]
+            helper.call(
+                "wheel", {**arguments, "offset": offset}, body=piece, timeout_s=BUILD_TIMEOUT_S
+            )
+            yield len(piece)

@@ -43,11 +43,14 @@ def fact_calls(
     Args:
         desired: The plan for it decides what must be known.
         has_texts: Whether contents of files are wanted, for --diff.
-        is_sudo_asked: Whether anybody becomes root is wanted, too.
+        is_sudo_asked: Whether anybody becomes root is wanted, too. Such a look follows another one, whose `conditions` hold
+            still: they may take a minute each.
         touch: Whether what is wanted and there is remembered as wanted now, so that no other operator prunes it.
     """
     sudo = is_sudo_asked and desired.variables.may_become_root
     asked = {**questions(desired, has_texts=has_texts), "sudo": sudo}
+    if is_sudo_asked:
+        asked["conditions"] = {}
     return [
         {"verb": "facts", "arguments": asked},
         {"verb": "installed", "arguments": installed_question(desired, touch=touch)},
@@ -120,6 +123,7 @@ def _with_installed(facts: MachineFacts, told: Mapping[str, Any]) -> MachineFact
         prunable=tuple(f"{kind}/{name}" for kind, names in prunable.items() for name in names),
         prunable_bytes=told.get("prunable_bytes", 0),
         wheels=frozenset(told.get("wheels") or ()),
+        blobs=frozenset(told.get("blobs") or ()),
     )
 
 

@@ -88,6 +88,8 @@ class Sketch:
     """Those that will have been installed."""
     may_bring_files: bool = False
     """Whether packages or commands of the plan may make files that are not there yet."""
+    has_fresh_units: bool = False
+    """Whether systemd will have read all its units again."""
 
 
 def declared_step(
@@ -185,6 +187,7 @@ def _file(declared: DeclaredStep, facts: MachineFacts, sketch: Sketch) -> Iterat
     before = _known_file(sketch, path)
     changes = _file_changes(before, action, content.sha256)
     if not changes:
+        yield from _stale_unit(path, facts, sketch, declared)
         return
     after = FileFact(
         kind="file",
@@ -207,12 +210,36 @@ def _file(declared: DeclaredStep, facts: MachineFacts, sketch: Sketch) -> Iterat
                 body=content.data,
                 as_root=declared.step.become,
             ),
+            *(_reload(path, sketch, declared) if before.sha256 != content.sha256 else ()),
         ),
         change=Change(path=path, before=before.text, after=after.text),
         size_bytes=len(content.data),
     )
-    if path.startswith(UNIT_FOLDERS) and before.sha256 != content.sha256:
-        yield _service_step("systemd: read its units again", {"reload": True}, declared)
+
+
+def unit_of(path: str | None) -> str | None:
+    """Return the name of the systemd unit that a file is of, also one in its folder of additions; None if it is of none."""
+    for folder in UNIT_FOLDERS:
+        if path is not None and path.startswith(folder):
+            name, _, more = path.removeprefix(folder).partition("/")
+            return name if not more else name.removesuffix(".d") if name.endswith(".d") else None
+    return None
+
+
+def _reload(path: str, sketch: Sketch, declared: DeclaredStep) -> Iterator[StepRequest]:
+    """Yield, for a file of a unit, the request that lets systemd read it: of the same step, so that a cut leaves both undone."""
+    if path.startswith(UNIT_FOLDERS):
+        sketch.has_fresh_units = True
+        yield _service_request({"reload": True}, declared)
+
+
+def _stale_unit(
+    path: str, facts: MachineFacts, sketch: Sketch, declared: DeclaredStep
+) -> Iterator[Step]:
+    """Yield a step for a file of a unit that is as wanted, but was not read by systemd: an earlier `up` was cut."""
+    if unit_of(path) in facts.stale_units and not sketch.has_fresh_units:
+        requests = tuple(_reload(path, sketch, declared))
+        yield Step(kind=Kind.SERVICE, title="systemd: read its units again", requests=requests)
 
 
 def _file_changes(before: FileFact, action: FileContent, sha256: str) -> list[str]:
@@ -267,6 +294,7 @@ def _line(declared: DeclaredStep, facts: MachineFacts, sketch: Sketch) -> Iterat
     content = before.text or ""
     after = edited(content, line=action.line, regexp=action.regexp, is_present=is_present)
     if after == content and before.kind != "missing":
+        yield from _stale_unit(path, facts, sketch, declared)
         return
     sketch.files[path] = dataclasses.replace(before, kind="file", text=after, sha256="")
     arguments = {
@@ -281,6 +309,7 @@ def _line(declared: DeclaredStep, facts: MachineFacts, sketch: Sketch) -> Iterat
         title=f"line in {path}: {_line_words(action, content)}",
         requests=(
             StepRequest(verb="edit_line", arguments=arguments, as_root=declared.step.become),
+            *_reload(path, sketch, declared),
         ),
         change=Change(path=path, before=before.text, after=after),
         size_bytes=len(after),
@@ -313,11 +342,13 @@ def _service(declared: DeclaredStep, facts: MachineFacts, sketch: Sketch) -> Ite
         is_doubtful = may_be_new and not {"enable", "start"} & set(do)
         asked = {"name": action.name, "do": do, "reload": True, "may_be_new": is_doubtful}
         also = ", if it is there by then" if is_doubtful else ""
-        yield _service_step(f"service {action.name}: {', '.join(do)}{also}", asked, declared)
+        title = f"service {action.name}: {', '.join(do)}{also}"
+        requests = (_service_request(asked, declared),)
+        yield Step(kind=Kind.SERVICE, title=title, requests=requests)
 
 
-def _service_step(title: str, asked: Mapping[str, Any], declared: DeclaredStep) -> Step:
-    request = StepRequest(
+def _service_request(asked: Mapping[str, Any], declared: DeclaredStep) -> StepRequest:
+    return StepRequest(
         verb="service",
         arguments={**asked, "timeout_s": SERVICE_TIMEOUT_S},
         as_root=declared.step.become,
@@ -325,7 +356,6 @@ def _service_step(title: str, asked: Mapping[str, Any], declared: DeclaredStep) 
         whole_s=(len(asked.get("do") or ()) + 1) * SERVICE_TIMEOUT_S + ANSWER_MARGIN_S,
         streams=True,
     )
-    return Step(kind=Kind.SERVICE, title=title, requests=(request,))
 
 
 def _command(declared: DeclaredStep, facts: MachineFacts, sketch: Sketch) -> Iterator[Step]:

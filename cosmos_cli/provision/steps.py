@@ -146,13 +146,16 @@ def _environments(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
 
 
 def _trees(facts: MachineFacts, desired: DesiredState) -> Iterator[Step]:
+    there = set(facts.blobs)
     for tree in desired.trees:
         if tree.hash not in facts.trees:
+            sent = {each.sha256: each.size_bytes for each in tree.files if each.sha256 in there}
+            there.difference_update(sent)  # moved into this one: of another it is a copy
             yield Step(
                 kind=Kind.TREE,
                 title=f"tree {tree.label}: send {len(tree.files)} files ({tree.hash[:12]})",
                 subject=tree,
-                size_bytes=tree.size_bytes,
+                size_bytes=tree.size_bytes - sum(sent.values()),
             )
 
 

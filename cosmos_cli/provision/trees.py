@@ -10,23 +10,22 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.metadata
+import io
 import os
 import stat
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import madns_runtime
-from cosmos_cli.cache import cache_folder
 from cosmos_cli.errors import InputError
-from cosmos_cli.evidence.run_directory import BUNDLE_SUFFIX, RUN_NAME
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from madns_runtime.bounded_files import read_regular_file, real_path
-from madns_runtime.processes import state_directory
+from cosmos_cli.provision.tree_rules import walk
+from madns_runtime.bounded_files import open_regular_file, read_regular_file
 
 if TYPE_CHECKING:  # importing the scenario's model takes longer than all that is done with it here
     from cosmos_cli.models.loading import ScenarioFile
@@ -35,14 +34,15 @@ DISTRIBUTION = "cosmos-madns"
 FILES_MAX = 5_000
 TREE_BYTES_MAX = 256 * 1024 * 1024
 BATCH_BYTES = 4 * 1024 * 1024
-"""Bytes of content per frame; a batch is compressed as one."""
+"""Bytes of content per frame: what is in it is compressed as one, and a larger file comes in several."""
 COMPRESSION_LEVEL = 6
+SAMPLE_BYTES = 65_536
+DENSE_SHARE = 0.9
+"""Share of its size that content keeps when it is sent as it is: each machine's copy costs processor time here."""
 ROUNDS_MAX = 3
 """Another operator who assembles the same tree at the same time may take what was just sent."""
 ASSEMBLE_TIMEOUT_S = 120.0
 LARGEST_SHOWN = 3
-CACHE_FOLDERS = ("__pycache__", "node_modules")
-CACHE_SUFFIXES = (".pyc", ".egg-info")
 FILE_MODE, PROGRAM_MODE = 0o444, 0o555
 
 Progress = Callable[[str, float], None]
@@ -73,21 +73,39 @@ class TreeFile:
         Raises:
             MachineFailure: It is no longer what it was when the tree was made.
         """
+        return b"".join(self.pieces(BATCH_BYTES))
+
+    def pieces(self, bytes_max: int) -> Iterator[bytes]:
+        """
+        Yield its content in pieces, the last one when all of it is known to be right.
+
+        Raises:
+            MachineFailure: As `read`.
+        """
+        digest, left_bytes = hashlib.sha256(), self.size_bytes
         try:
-            content = (
-                self.source
-                if isinstance(self.source, bytes)
-                else read_regular_file(self.source, bytes_max=self.size_bytes)
-            )
-        except OSError:  # it is gone or has grown, or a pipe has taken its place
-            content = None
-        if content is None or hashlib.sha256(content).hexdigest() != self.sha256:
+            with self._opened() as stream:
+                while piece := stream.read(min(left_bytes, bytes_max)):
+                    left_bytes -= len(piece)
+                    digest.update(piece)
+                    if not left_bytes:
+                        break
+                    yield piece
+                is_right = not stream.read(1) and digest.hexdigest() == self.sha256
+        except OSError:  # it is gone, or a pipe has taken its place
+            is_right = False
+        if not is_right:
             raise MachineFailure(
                 FailureKind.DATA,
                 f"{self.source!s} was changed or removed while it was sent",
                 "repeat",
             )
-        return content
+        yield piece
+
+    def _opened(self) -> BinaryIO:
+        if isinstance(self.source, bytes):
+            return io.BytesIO(self.source)
+        return os.fdopen(open_regular_file(self.source), "rb")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,7 +144,7 @@ def runtime_tree() -> Tree:
     package = Path(madns_runtime.__file__).parent
     files = [
         read_tree_file(path, f"{package.name}/{name}")
-        for path, name in _walk(package, package)
+        for path, name in walk(package)
         if name.endswith((".py", ".json", "py.typed")) or "/data/" in f"/{name}"
     ]
     return tree_of("runtime", [*files, *_distribution_files()])
@@ -136,11 +154,11 @@ def scenario_tree(scenario_file: ScenarioFile) -> Tree:
     """
     Return the scenario's folder: what its files name, and its plug-ins with their neighbours.
 
-    Hidden files, caches, virtual environments, runs, COSMoS's own state and empty folders are left out. A link to a file or
-    folder within is sent as what it leads to.
+    Hidden files, caches, virtual environments, runs, COSMoS's own state and empty folders are left out, and so are links
+    to such. A link to a file or folder within is sent as what it leads to.
 
     Raises:
-        InputError: The folder is larger than a scenario's should be, or has a link that leads outside.
+        InputError: The folder is larger than a scenario's should be, or has another link that leads outside.
     """
     return folder_tree(f"scenario {scenario_file.scenario.name}", scenario_file.base_directory)
 
@@ -154,7 +172,7 @@ def folder_tree(label: str, folder: Path) -> Tree:
     """
     found = []
     total_bytes = 0
-    for path, name in _walk(folder, folder):
+    for path, name in walk(folder):
         found.append((path, name))
         total_bytes += _size_bytes(path)
         if len(found) > FILES_MAX or total_bytes > TREE_BYTES_MAX:
@@ -202,15 +220,36 @@ def _send_blobs(
 ) -> None:
     whole_bytes = sum(file.size_bytes for file in files)
     sent_bytes = 0
-    for batch in _batches(files):
-        body = zlib.compress(b"".join(file.read() for file in batch), COMPRESSION_LEVEL)
-        arguments = {
-            "folder": layout.trees,
-            "blobs": [[file.sha256, file.size_bytes] for file in batch],
-        }
-        helper.call("blobs", arguments, body=body, timeout_s=ASSEMBLE_TIMEOUT_S)
-        sent_bytes += sum(file.size_bytes for file in batch)
+    for verb, arguments, content in _frames(files):
+        helper.call(
+            verb,
+            {"folder": layout.trees, **arguments},
+            body=_packed(content),
+            timeout_s=ASSEMBLE_TIMEOUT_S,
+        )
+        sent_bytes += len(content)
         progress(f"files {sent_bytes / 1e6:.1f} MB", sent_bytes / max(1, whole_bytes))
+
+
+def _frames(files: Sequence[TreeFile]) -> Iterator[tuple[str, Mapping[str, Any], bytes]]:
+    """Yield verb, arguments and content of each frame: many small files together, a large one in pieces."""
+    for batch in _batches([file for file in files if file.size_bytes <= BATCH_BYTES]):
+        blobs = [[file.sha256, file.size_bytes] for file in batch]
+        yield "blobs", {"blobs": blobs}, b"".join(file.read() for file in batch)
+    for file in files:
+        offset = 0
+        for piece in file.pieces(BATCH_BYTES) if file.size_bytes > BATCH_BYTES else ():
+            place = {"size": file.size_bytes, "offset": offset, "length": len(piece)}
+            yield "blob", {"sha256": file.sha256, **place}, piece
+            offset += len(piece)
+
+
+def _packed(content: bytes) -> bytes:
+    """Return content in the form of zlib; what its midst shows to be packed already is not compressed once more."""
+    middle = len(content) // 2
+    sample = content[middle : middle + SAMPLE_BYTES]
+    is_dense = len(zlib.compress(sample, COMPRESSION_LEVEL)) > DENSE_SHARE * len(sample)
+    return zlib.compress(content, 0 if is_dense else COMPRESSION_LEVEL)
 
 
 def _batches(files: Sequence[TreeFile]) -> Iterator[list[TreeFile]]:
@@ -266,96 +305,11 @@ def _file(name: str, content: bytes, mode: int, source: Path | None = None) -> T
     )
 
 
-def entries_in(folder: Path) -> list[os.DirEntry[str]]:
-    """
-    Return what lies in a folder, by name.
-
-    Raises:
-        InputError: It cannot be read.
-    """
-    try:
-        return sorted(os.scandir(folder), key=lambda entry: entry.name)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read: {error.strerror or error}") from error
-
-
-def _walk(folder: Path, top: Path, above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, str]]:
-    """Yield the files of a folder that belong to a tree, each with its path within *top*."""
-    above = (*above, folder.resolve())
-    for entry in entries_in(folder):
-        path = folder / entry.name
-        if not is_name_of_tree(entry.name):
-            continue
-        if not entry.name.isprintable():
-            raise InputError(f"{str(path)!r}: expected a file name of printable characters")
-        if entry.is_symlink():
-            _refuse_outside(path, top)
-        try:
-            kind = _kind(entry, path, above)
-        except OSError as error:  # such as a link to itself
-            raise InputError(f"{path}: cannot be read: {error.strerror}; remove it") from error
-        if kind == "link":
-            raise InputError(f"{path}: a link that leads nowhere; remove it")
-        if kind == "folder":
-            yield from _walk(path, top, above)
-        elif kind:
-            yield path, path.relative_to(top).as_posix()
-
-
-def _kind(entry: os.DirEntry[str], path: Path, above: tuple[Path, ...]) -> str:
-    """Return what an entry is: a folder or file that belongs to the tree, a link to nothing, or empty for the rest."""
-    if entry.is_dir():
-        return "folder" if real_path(path) not in above and is_folder_of_tree(path) else ""
-    if entry.is_file():
-        return "file"
-    return "link" if entry.is_symlink() else ""
-
-
-def is_name_of_tree(name: str) -> bool:
-    """Tell whether what has this name may belong to a tree: no hidden file, no cache, no package of a run."""
-    is_bundle = name.endswith(BUNDLE_SUFFIX) and RUN_NAME.match(name) is not None
-    return not (name.startswith(".") or name.endswith(CACHE_SUFFIXES) or is_bundle)
-
-
-def is_folder_of_tree(path: Path) -> bool:
-    """Tell whether a folder belongs to a tree: no cache, virtual environment or run, nor what COSMoS itself keeps there."""
-    return not (
-        _is_run(path)
-        or path.name in CACHE_FOLDERS
-        or os.path.exists(path / "pyvenv.cfg")
-        or _is_own(path)
-    )
-
-
-def _is_own(path: Path) -> bool:
-    """Tell whether a folder is where this computer's state or cache is kept: it changes with every run."""
-    register = state_directory()
-    kept = (register, register.parent, cache_folder())
-    return os.path.realpath(path) in map(os.path.realpath, kept)
-
-
-def _is_run(path: Path) -> bool:
-    """Tell whether a folder is a run's: by its name and part of what it holds, or renamed, as a copy is, by all of it."""
-    is_planned = os.path.exists(path / "plan.json")  # of a folder that may not be entered: False
-    has_records = os.path.isdir(path / "host") and os.path.isdir(path / "agents")
-    is_named = RUN_NAME.match(path.name) is not None
-    return (is_planned or has_records) if is_named else (is_planned and has_records)
-
-
 def _size_bytes(path: Path) -> int:
     try:
         return path.stat().st_size
     except OSError as error:  # removed since the folder was listed
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _refuse_outside(path: Path, top: Path) -> None:
-    real = real_path(path)
-    if not real.is_relative_to(top.resolve()):
-        raise InputError(
-            f"{path}: a link that leads out of the scenario's folder, to {real}; machines are sent"
-            f" {top} and no more, so copy into it what the scenario needs"
-        )
 
 
 def _too_large(folder: Path, found: Sequence[tuple[Path, str]]) -> InputError:

@@ -220,15 +220,17 @@ class MachineUp:
         also: Sequence[Call] = (),
     ) -> list[Answer]:
         """Ask for all facts at once, and for *also*, whose answers are returned."""
+        known = self._facts.conditions if is_sudo_asked else {}
         calls = fact_calls(
             desired,
             has_texts=self.options.has_texts,
             is_sudo_asked=is_sudo_asked,
             touch=touch,
         )
-        self.result.facts, others = gather_facts(
+        facts, others = gather_facts(
             self.helper, [*calls, *also], may_become_root=desired.variables.may_become_root
         )
+        self.result.facts = dataclasses.replace(facts, conditions={**known, **facts.conditions})
         return others
 
     def _raise_first(self, answers: Sequence[Answer], udp: dict[str, Any]) -> None:

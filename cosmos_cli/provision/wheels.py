@@ -17,6 +17,7 @@ import hashlib
 import json
 import os
 import shutil
+import stat
 import subprocess
 import tempfile
 import zipfile
@@ -50,6 +51,7 @@ MAKING_S_MAX = 86_400.0
 WHEEL_BYTES_MAX = 256 * 1024 * 1024
 BUILD_TIMEOUT_S = 600.0
 LAST_LINES = 8
+PROGRAM_MODE = 0o755
 NOTE_BYTES_MAX = 4096
 SCHEME = "file://"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
@@ -276,6 +278,8 @@ def _kept_of_folder(folder: Path, text: str, say: Callable[[str], None]) -> Path
             target = source / file.path
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(file.read())
+            if file.mode & stat.S_IXUSR:
+                target.chmod(PROGRAM_MODE)
         say(f"building a wheel of {text}")
         with timed(HERE, f"build a wheel of {text}"):
             wheel = _built(source, made, text)

@@ -13,7 +13,7 @@ from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.document import read_document
 from cosmos_cli.models.scenario_outline import ScenarioOutline, is_scenario, read_outline
 from cosmos_cli.models.yaml_source import FILE_BYTES_MAX, UTF_16, read_source
-from cosmos_cli.provision.trees import is_folder_of_tree, is_name_of_tree
+from cosmos_cli.provision.tree_rules import is_folder_of_tree, is_name_of_tree
 from cosmos_cli.testing.case import CaseSettings, SuiteCase, make_cases
 from cosmos_cli.testing.expression import Matcher
 from madns_runtime.bounded_files import read_regular_file, real_path

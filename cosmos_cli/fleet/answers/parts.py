@@ -105,6 +105,7 @@ def facts_shape(asked: Asked) -> Shape:
             "services": map_with(
                 keys_of(asked, "services"), record({"enabled": name, "active": name})
             ),
+            "stale_units": names,
             "packages": map_with(keys_of(asked, "packages"), maybe(name)),
         }
     )

@@ -118,6 +118,7 @@ def _installed(asked: Asked) -> Shape:
             "prunable": prunable,
             "prunable_bytes": size,
             "wheels": names,
+            "blobs": names,
         }
     )
 
@@ -261,6 +262,7 @@ _DOCTOR: Mapping[str, Shape] = {
     ),
 }
 _ANSWERS: Mapping[str, Callable[[Asked], Shape]] = {
+    "blob": _always(nothing),
     "blobs": _always(nothing),
     "boot": _always(
         record(

@@ -59,6 +59,7 @@ NOT_TRIED = {
 SEEDS = 40
 ROUND_TRIPS = {"address": "127.0.0.1", "port": 9, "nonce_hex": "00" * 16, "count": 2}
 WAKE_UPS = {"count": 2, "rate_hz": 100.0, "policy": "normal", "priority": 1}
+SYSTEM = {"services": ["ssh"], "units": ["ssh.service"], "packages": ["bash"], "sudo": False}
 A_TREE = {"hash": EMPTY, "label": "l", "files": [["a", EMPTY, 0o444]]}
 
 
@@ -79,12 +80,13 @@ def questions(root: Path) -> dict[str, dict]:
         "write_file": {"path": f"{run}/log"},
         "edit_line": {"path": f"{own}/f", "line": "x", "is_present": True, "create": True},
         "set_values": {"values": [[f"{own}/f", "1"]]},
-        "facts": {"root": own, "services": ["ssh"], "packages": ["bash"], "sudo": False, **look},
+        "facts": {"root": own, **SYSTEM, **look},
         "look": look,
         "installed": {"folders": folders, **wanted},
         "several": {"calls": [call("look", look), call("living", {})]},
         "tree": {"folder": f"{own}/trees", **A_TREE},
         "blobs": {"folder": f"{own}/trees", "blobs": []},
+        "blob": {"folder": f"{own}/trees", "sha256": EMPTY, "size": 1, "offset": 0, "length": 0},
         "environment": {
             "folder": f"{own}/environments",
             "wheels_folder": f"{own}/wheels",

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from cosmos_cli.onboard import content_changes, content_store
+from cosmos_cli.onboard import content_changes, content_store, environment
 from cosmos_cli.onboard import installed as module
 from cosmos_cli.onboard.installed import installed
 from cosmos_cli.onboard.request_loop import VerbRequest
@@ -98,20 +98,78 @@ def test_room_of_what_is_prunable_is_that_of_files_whose_last_name_goes(tmp_path
     assert module.freed_bytes([str(one), str(other), str(tmp_path / "gone")]) == room >= 100_000
 
 
-def test_clock_that_is_set_forward_makes_nothing_old(tmp_path, monkeypatch):
-    """As by the first answer of a time service, on a board without a clock of its own."""
+@pytest.mark.parametrize("step_s", [86_400 * 365, -7200])
+def test_clock_that_is_set_makes_nothing_old(tmp_path, monkeypatch, step_s):
+    """As by the first answer of a time service, on a board without a clock of its own or with one that is ahead."""
     sent, left = tmp_path / ".blobs", tmp_path / ".left"
     sent.mkdir()
     left.mkdir()
-    long_ago_s = content_changes.LEFT_OVER_S + 60
-    os.utime(left, (left.stat().st_mtime - long_ago_s,) * 2)
-    step_s = 86_400 * 365
-    true_clock = content_changes.time.clock_gettime
+    now_s = sent.stat().st_mtime
+    made_s = now_s + min(0, step_s)  # since the clock was set back, or before it was set forward
+    os.utime(sent, (made_s, made_s))
+    long_ago_s = made_s - content_store.LEFT_OVER_S - 60
+    os.utime(left, (long_ago_s, long_ago_s))
+    step_clock(monkeypatch, step_s)
 
-    def stepped(clock):
-        return true_clock(clock) + (step_s if clock == content_changes.time.CLOCK_REALTIME else 0)
-
-    monkeypatch.setattr(content_changes.time, "clock_gettime", stepped)
     content_changes.remove_left_overs(str(tmp_path))
 
     assert os.listdir(tmp_path) == [".blobs"]
+
+
+def test_left_over_of_a_time_to_come_grows_old_from_now_on(tmp_path, monkeypatch):
+    left, young = tmp_path / ".left", tmp_path / ".young"
+    left.mkdir()
+    young.mkdir()
+    os.utime(left, (4e9, 4e9))
+    before = young.stat().st_mtime_ns
+
+    content_changes.remove_left_overs(str(tmp_path))
+    assert {".left", ".young"} == set(os.listdir(tmp_path))
+    assert young.stat().st_mtime_ns == before
+    step_clock(monkeypatch, 2 * content_store.LEFT_OVER_S, content_store.time.CLOCK_BOOTTIME)
+    step_clock(monkeypatch, 2 * content_store.LEFT_OVER_S)
+    content_changes.remove_left_overs(str(tmp_path))
+
+    assert os.listdir(tmp_path) == []
+
+
+def step_clock(monkeypatch, step_s, which=content_store.time.CLOCK_REALTIME):
+    """Set a clock of this process forward, or back."""
+    true_clock = content_store.time.clock_gettime
+    monkeypatch.setattr(
+        content_store.time,
+        "clock_gettime",
+        lambda clock: true_clock(clock) + (step_s if clock == which else 0),
+    )
+
+
+def test_what_was_left_half_made_is_prunable_and_its_room_is_counted(folders, tmp_path):
+    sent = tmp_path / "trees" / ".blobs"
+    part = tmp_path / "wheels" / ".ab.part"
+    sent.mkdir()
+    (sent / "cd").write_bytes(b"x" * 100_000)
+    part.write_bytes(b"x" * 100_000)
+    room = 2 * part.stat().st_blocks * module.BLOCK_BYTES
+
+    young = ask_for_tree(folders)
+    for path in (sent, part):
+        os.utime(path, (1, 1))
+    old = ask_for_tree(folders)
+
+    assert young["prunable"]["trees"] == young["prunable"]["wheels"] == []
+    assert young["blobs"] == ["cd"]
+    assert old["prunable"]["trees"] == [".blobs"] and old["prunable"]["wheels"] == [".ab.part"]
+    assert old["prunable_bytes"] == room
+    assert old["blobs"] == []  # the next tree removes them first
+    environment.prune_installed(
+        VerbRequest(arguments={**question(folders), "compiled": str(tmp_path / "compiled")})
+    )
+    assert not sent.exists() and not part.exists()
+
+
+def question(folders):
+    return {"folders": folders, "trees": ["wanted"], "environments": []}
+
+
+def ask_for_tree(folders):
+    return installed(VerbRequest(arguments=question(folders)))

@@ -4,6 +4,7 @@ import io
 
 import pytest
 
+from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.onboard import facts, request_loop
 from cosmos_cli.onboard.request_loop import HelperRefusal, Rooted, VerbRequest
 
@@ -14,6 +15,7 @@ pytestmark = pytest.mark.process
     ("script", "kind", "text"),
     [
         ("exec sleep 2", "timeout", "sudo -n true has not ended in 0.2 s"),
+        ('[ "$2" = true ] || exec sleep 2', "timeout", "sudo -n has started nothing in 0.2 s"),
         ("echo sudo: a password is required >&2; exit 1", "no_sudo", "a password is required"),
         (None, "no_sudo", "cannot become root without a password: there is no sudo"),
     ],
@@ -30,6 +32,40 @@ def test_reason_for_no_root_is_told(tmp_path, monkeypatch, script, kind, text):
 
     assert caught.value.kind == kind
     assert text in caught.value.text
+    assert ("name server" in caught.value.advice) == (kind == "timeout")
+
+
+@pytest.mark.parametrize("is_streamed", [False, True])
+def test_first_answer_of_root_waits_for_sudo_and_later_ones_do_not(is_streamed):
+    """A machine tells itself that its sudo is slow; who waits for less long learns nothing."""
+
+    class Played(Helper):
+        greeting = {"uid": 1000}  # noqa: RUF012
+        waits = []  # noqa: RUF012
+
+        def __init__(self):
+            self._is_root_asked = False
+            self.machine = "pi01"
+
+        def _ask(self, *_, **__):
+            pass
+
+        def _read_answer(self, expected, *, timeout_s):
+            self.waits.append(timeout_s)
+            is_part = is_streamed and len(self.waits) % 2 == 1
+            return {"ok": True, "value": None, "part": is_part}, b""
+
+    helper = Played()
+    helper.waits = []
+    for as_root in (False, True, True):
+        if is_streamed:
+            list(helper.parts("living", as_root=as_root, timeout_s=20.0))
+        else:
+            helper.call("living", as_root=as_root, timeout_s=20.0)
+
+    long_s = 20.0 + 2 * request_loop.SUDO_TIMEOUT_S
+    each = 2 if is_streamed else 1
+    assert [wait > long_s for wait in helper.waits] == [index == each for index in range(3 * each)]
 
 
 @pytest.mark.parametrize(

@@ -155,6 +155,20 @@ def test_command_whose_condition_still_fails_is_noted(place):
     ]
 
 
+def test_condition_is_asked_once_where_it_holds_and_no_more_than_needed_where_it_does_not(place):
+    """Each may take a minute: for the plan, when no other command works there, before the command and after it."""
+    asked, made = place / "asked", place / "made/a"
+    unless = f"echo x >> {asked}; test -e {made}"
+    provision = ({"become": False, "command": {"run": f"touch {made}", "unless": unless}},)
+    times = []
+    for _ in range(2):
+        brought = up(connection_to(place / "cosmos"), machine_at(place, provision=provision))
+        assert brought.failure is None
+        times.append(len(asked.read_text().splitlines()))
+
+    assert times == [4, 5]
+
+
 def test_condition_that_an_earlier_step_met_is_seen(place):
     target = place / "made/a"
     provision = (

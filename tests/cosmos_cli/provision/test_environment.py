@@ -233,6 +233,23 @@ def test_cut_transfer_of_a_wheel_is_resumed(machine, house, tmp_path, monkeypatc
     assert 0 < sent_bytes < wheel.stat().st_size - 4000
 
 
+def test_wheel_is_sent_anew_where_what_came_before_is_not_its_beginning(machine, house, tmp_path):
+    """As a power cut may leave it: a length without the bytes."""
+    wheel = make_wheel(tmp_path / "made", "bulk", files={"bulk/x": os.urandom(20_000)})
+    environment = house.environment(wheel)
+    (locked,) = environment.lock
+    sent = sent_wheel(environment.wheel(locked), locked, environment.platform).locked
+    partial = Path(machine.layout.wheels, f".{sent.sha256}.part")
+    partial.parent.mkdir(parents=True)
+    partial.write_bytes(bytes(sent.size_bytes // 2))
+
+    assert install(machine, environment)
+
+    offsets = [given["offset"] for verb, given, _ in machine.calls if verb == "wheel"]
+    assert offsets == [sent.size_bytes // 2, 0]
+    assert is_whole(machine, environment)
+
+
 def test_helper_killed_at_any_moment_leaves_nothing_half(machine, house, tmp_path):
     files = {f"bulk/m{index}.py": os.urandom(2000) for index in range(150)}
     killed = 0

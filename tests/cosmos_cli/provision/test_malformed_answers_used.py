@@ -154,6 +154,7 @@ INSTALLED = {
     "prunable": {"trees": ["a"], "environments": [], "wheels": []},
     "prunable_bytes": 4096,
     "wheels": ["numpy-2.0.0.dist-info"],
+    "blobs": ["0" * 64],
 }
 ROUND_TRIPS = {"round_trips": {"count": 1}, "wake_ups": {"count": 1}}
 USES = {

@@ -215,6 +215,41 @@ def test_condition_of_a_command_finds_the_programs_that_the_command_finds(tmp_pa
         assert board.call("look", asked).value["conditions"] == {"it": True}
 
 
+@pytest.mark.process
+def test_slow_condition_of_a_command_gives_signs_of_life(tmp_path):
+    """Before the command and after it; it has a minute, and who waits gives up sooner without a sign."""
+    unless = f"sleep 1.5; test -e {tmp_path}/a"
+    asked = {"run": f"touch {tmp_path}/a", "unless": unless, "timeout_s": PATIENCE_S}
+
+    parts = [part.value for part in system.command(VerbRequest(arguments=asked))]
+
+    assert parts[-1] == {"ran": True, "notes": []}
+    assert parts[:-1].count({"is_running": True}) == len(parts) - 1 >= 2
+    assert [p.value for p in system.command(VerbRequest(arguments=asked))][-1] == {"ran": False}
+
+
+@pytest.mark.process
+def test_condition_that_never_ends_is_told_as_such(monkeypatch):
+    monkeypatch.setattr(facts, "CONDITION_TIMEOUT_S", 0.2)
+    asked = {"run": "true", "unless": "sleep 60", "timeout_s": PATIENCE_S}
+
+    with pytest.raises(HelperRefusal, match=r"unless: sleep 60: not done in 0.2 s"):
+        list(system.command(VerbRequest(arguments=asked)))
+
+
+@pytest.mark.process
+def test_unit_whose_files_systemd_has_not_read_is_told(tmp_path, monkeypatch):
+    (tmp_path / "systemctl").write_text(
+        '#!/bin/sh\n[ "$4" = a.service ] && echo NeedDaemonReload=yes || echo NeedDaemonReload=no\n'
+    )
+    (tmp_path / "systemctl").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+
+    told = facts.facts(VerbRequest(arguments={"units": ["a.service", "b.service"]}))
+
+    assert told["stale_units"] == ["a.service"]
+
+
 SYSTEMCTL = r"""#!/bin/sh
 echo "$*" >> "$0.asked"
 case "$1" in is-enabled) echo "$ENABLED" ;; is-active) echo "$ACTIVE" ;; esac

@@ -88,6 +88,23 @@ def test_a_folder_is_built_once_until_it_changes(folder):
     assert len(builds) == 2
 
 
+def test_programs_of_a_folder_are_built_as_programs(folder, monkeypatch):
+    (folder / "cars/tool").write_text("#!/bin/sh\n")
+    (folder / "cars/tool").chmod(0o755)
+    modes = {}
+    build = wheels._built
+
+    def look(source: Path, made: Path, text: str) -> Path:
+        modes.update({path.name: path.stat().st_mode & 0o777 for path in source.iterdir()})
+        return build(source, made, text)
+
+    monkeypatch.setattr(wheels, "_built", look)
+    with_own_wheels(["./cars"], folder)
+
+    assert modes["tool"] == 0o755
+    assert not modes["cars.py"] & 0o111
+
+
 def test_a_wheel_that_left_the_cache_is_built_again(folder):
     (text,) = with_own_wheels(["./cars"], folder)
     own_wheel(text)[1].unlink()

@@ -13,9 +13,11 @@ from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.models.machine_facts import MachineFacts
 from cosmos_cli.onboard.facts import _file
 from cosmos_cli.onboard.files import replace_file
+from cosmos_cli.provision.desired import questions
 from cosmos_cli.provision.gather_facts import gather_facts
 from cosmos_cli.provision.step import Kind, Step
 from cosmos_cli.provision.steps import RESERVE_BYTES, check_possible, notes_of, plan_steps
+from cosmos_cli.provision.trees import TreeFile, tree_of
 from cosmos_cli.provision.up import MachineUp, UpOptions
 from cosmos_cli.provision.up_table import MachineResult
 
@@ -59,7 +61,10 @@ class FakeEnvironment:
 class FakeTree:
     label: str = "runtime"
     hash: str = "0123456789abcdef"
-    files: tuple = ("a", "b", "c")
+    files: tuple = tuple(
+        TreeFile(path=name, sha256=name * 64, mode=0o444, size_bytes=1, source=b"")
+        for name in ("a", "b", "c")
+    )
     size_bytes: int = 1_000_000
 
 
@@ -205,6 +210,37 @@ def test_wheels_that_are_there_take_no_room():
 
     assert step.size_bytes == ENVIRONMENT_BYTES // 2
     check_possible(facts_of(disk={"free_bytes": ENVIRONMENT_BYTES}), (step,))
+
+
+@pytest.mark.parametrize("kind", ["file", "line"])
+def test_unit_is_read_by_systemd_in_the_step_that_writes_it(kind):
+    """So that a cut between both leaves the step undone, or what was written is told as not read."""
+    path = "/etc/systemd/system/a.service"
+    action = (
+        {"file": {"dest": path, "content": "[Service]\n"}}
+        if kind == "file"
+        else {"line": {"path": path, "line": "[Service]", "create": True}}
+    )
+    wants = wanted(provision=(action,))
+
+    (step,) = plan_steps(facts_of(), wants)
+
+    assert [request.verb for request in step.requests][1:] == ["service"]
+    assert step.requests[1].arguments["reload"] and step.requests[1].as_root
+    assert questions(wants)["units"] == ["a.service"]
+
+
+def test_what_was_sent_before_needs_no_room_again():
+    files = tuple(
+        TreeFile(path=name, sha256=sha256, mode=0o444, size_bytes=1000, source=b"")
+        for name, sha256 in (("a", "aa"), ("b", "aa"), ("c", "cc"))
+    )
+    first, second = tree_of("first", files), tree_of("second", files[1:])
+    facts = dataclasses.replace(facts_of(), blobs=frozenset({"aa", "dd"}))
+
+    steps = plan_steps(facts, wanted(trees=(first, second)))
+
+    assert [step.size_bytes for step in steps] == [2000, 2000]
 
 
 @pytest.mark.parametrize("missing_bytes", [0, 1])

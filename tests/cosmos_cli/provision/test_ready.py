@@ -12,6 +12,7 @@ from onboard_machine import OwnMachine
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.models.inventory import Machine, Variables
 from cosmos_cli.models.loading import load_scenario
+from cosmos_cli.provision import before_run
 from cosmos_cli.provision.before_run import Cargo, cargo_of, make_ready
 from cosmos_cli.provision.environment import install_environment
 from cosmos_cli.provision.platform import greeted_platform
@@ -163,6 +164,19 @@ def test_edited_flight_software_needs_no_up(machine, index, scenario):
 
     assert (Path(second.base_directory) / "flight.py").read_text() == "gain = 2\n"
     assert (Path(first.base_directory) / "flight.py").read_text() == "gain = 1\n"
+
+
+def test_full_disk_names_the_command_that_makes_room(machine, index, scenario, monkeypatch):
+    def refuse(*_):
+        raise MachineFailure(FailureKind.DISK_FULL, "No space left on device", "make room there")
+
+    installed(machine, "navlib")
+    monkeypatch.setattr(before_run, "send_tree", refuse)
+    with pytest.raises(MachineFailure) as caught:
+        ready(machine, scenario)
+
+    assert caught.value.kind is FailureKind.DISK_FULL
+    assert f"`cosmos up -i INVENTORY {scenario.path}`, which removes" in caught.value.advice
 
 
 def test_all_machines_of_a_run_get_the_files_as_they_were_at_its_start(machine, index, scenario):

@@ -1,5 +1,7 @@
 """Trees: what belongs to one, and that a machine has all of it or nothing, whatever is cut."""
 
+import dataclasses
+import errno
 import hashlib
 import os
 import shutil
@@ -14,14 +16,16 @@ from onboard_machine import OwnMachine, snapshot
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.launch import flown_copy
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.onboard import installed
 from cosmos_cli.onboard import trees as onboard_trees
-from cosmos_cli.provision import trees
+from cosmos_cli.onboard.request_loop import VERBS, VerbRequest
+from cosmos_cli.provision import tree_rules, trees
 from cosmos_cli.provision.environment import ask_installed, installed_request
+from cosmos_cli.provision.tree_rules import is_folder_of_tree
 from cosmos_cli.provision.trees import (
     TreeFile,
-    is_folder_of_tree,
     runtime_tree,
     scenario_tree,
     send_tree,
@@ -178,6 +182,58 @@ def test_links_within_are_sent_as_what_they_lead_to(folder, machine):
     assert on_machine(machine, tree)["alias.csv"] == b"1,2\n"
 
 
+@pytest.mark.parametrize(
+    ("name", "target", "files"),
+    [
+        ("runs", "runs", ()),
+        ("results", "big", ("0007-small/plan.json", "0008-small.tar.zst", ".index")),
+        ("0007-small", "moved", ("host/x", "agents/x")),
+        ("last", "0007-small", ("plan.json",)),
+        ("env", "env", ("pyvenv.cfg", "bin/python")),
+        ("node_modules", "modules", ("x.js",)),
+    ],
+)
+def test_links_to_what_is_left_out_are_left_out_wherever_it_lies(folder, name, target, files):
+    before = the_tree(folder)
+    for path in (folder.parent / "disk" / target / file for file in files):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("x")
+    (folder.parent / "disk" / target).mkdir(parents=True, exist_ok=True)
+    (folder / name).symlink_to(folder.parent / "disk" / target)
+
+    assert the_tree(folder).hash == before.hash
+    assert set(flown_copy.names_in(folder)) == set(paths(before))
+    assert flown_copy._found(folder, left_out := []) and not left_out
+
+
+def test_link_to_the_folder_of_all_runs_is_left_out_whatever_else_is_there(folder, monkeypatch):
+    before = the_tree(folder)
+    disk = folder.parent / "disk"
+    disk.mkdir()
+    (disk / "notes.txt").write_text("x")
+    (folder / "results").symlink_to(disk)
+    with pytest.raises(InputError, match=r"results: a link that leads out"):
+        the_tree(folder)
+
+    monkeypatch.setenv("COSMOS_RUNS", str(disk))
+
+    assert the_tree(folder).hash == before.hash
+
+
+def test_links_to_folders_with_links_end_with_a_word(folder, monkeypatch):
+    """Each level doubles the ways to the last one."""
+    monkeypatch.setattr(tree_rules, "FOLDERS_MAX", 100)
+    for level in range(30):
+        inner = folder / f"level{level}"
+        inner.mkdir()
+        for name in ("a", "b"):
+            (inner / name).symlink_to(f"../level{level + 1}")
+    (folder / "level30").mkdir()
+
+    with pytest.raises(InputError, match=r"at most 100 folders, found more; do links lead"):
+        the_tree(folder)
+
+
 @pytest.mark.parametrize("target", ["/etc/hostname", "../outside.txt", "gone.txt"])
 def test_links_that_lead_outside_or_nowhere_are_refused_by_name(folder, target):
     (folder.parent / "outside.txt").write_text("x")
@@ -293,6 +349,140 @@ def test_large_trees_come_in_batches(machine, monkeypatch):
     assert [len(g["blobs"]) for verb, g, _ in machine.calls if verb == "blobs"] == [2, 2, 2, 1]
     assert told == sorted(told) and told[-1] == 1.0
     assert is_whole(machine, tree)
+
+
+def test_large_file_comes_in_pieces(machine, monkeypatch):
+    monkeypatch.setattr(trees, "BATCH_BYTES", 1000)
+    tree = made_tree(exact=os.urandom(1000), large=os.urandom(2500), other=os.urandom(1001))
+    told = []
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree, lambda what, share: told.append(share))
+
+    pieces = [g for verb, g, _ in machine.calls if verb == "blob"]
+    assert [(g["offset"], g["length"]) for g in pieces] == [
+        (0, 1000),
+        (1000, 1000),
+        (2000, 500),
+        (0, 1000),
+        (1000, 1),
+    ]
+    assert told == sorted(told) and told[-1] == 1.0
+    assert on_machine(machine, tree) == tree_files(tree)
+
+
+def test_piece_that_does_not_follow_is_refused(machine):
+    how = {"folder": machine.layout.trees, "sha256": "0" * 64, "size": 9, "length": 4}
+    with machine.board() as board:
+        board.call("blob", {**how, "offset": 0}, body=zlib.compress(b"text"))
+        with pytest.raises(MachineFailure, match="expected 5 B, has 4 B"):
+            board.call("blob", {**how, "offset": 5}, body=zlib.compress(b"text"))
+        board.call("blob", {**how, "offset": 0}, body=zlib.compress(b"text"))  # begun anew
+        with pytest.raises(MachineFailure, match="not what was announced"):
+            board.call("blob", {**how, "offset": 4, "length": 5}, body=zlib.compress(b"wrong"))
+
+    assert [p for p in Path(machine.layout.trees).rglob("*") if p.is_file()] == []
+
+
+def test_piece_keeps_what_was_sent_young(tmp_path):
+    """A large file over a slow link takes longer than what nobody has touched is kept."""
+    how = {"folder": str(tmp_path), "sha256": "0" * 64, "size": 9, "length": 4}
+    for offset in (0, 4):
+        given = VerbRequest(arguments={**how, "offset": offset}, body=zlib.compress(b"text"))
+        onboard_trees.blob(given)
+        assert (tmp_path / ".blobs").stat().st_mtime > 1
+        os.utime(tmp_path / ".blobs", (1, 1))
+
+
+def test_large_file_that_changes_while_it_is_sent_is_told(folder, machine, monkeypatch):
+    monkeypatch.setattr(trees, "BATCH_BYTES", 1000)
+    (folder / "data.bin").write_bytes(os.urandom(2500))
+    tree = the_tree(folder)
+    with machine.board() as board, pytest.raises(MachineFailure, match=r"data.bin was changed"):
+        send_tree(
+            board,
+            machine.layout,
+            tree,
+            lambda *_: (folder / "data.bin").write_bytes(os.urandom(2500)),
+        )
+
+
+def test_what_does_not_get_smaller_is_not_compressed():
+    dense, text = os.urandom(200_000), b"gain = 1\n" * 20_000
+
+    assert len(dense) < len(trees._packed(dense)) < len(dense) + 100
+    assert len(trees._packed(text)) < len(text) / 10
+    assert [zlib.decompress(trees._packed(each)) for each in (dense, text, b"")] == [
+        dense,
+        text,
+        b"",
+    ]
+
+
+def test_tree_takes_the_room_of_its_files_once(machine):
+    """What was sent is moved into the tree, so that a disk needs not hold both."""
+    contents = {f"f{index}": os.urandom(3000) for index in range(5)}
+    tree = made_tree(**contents, again=contents["f0"])
+    files = [[file.path, file.sha256, file.mode] for file in tree.files]
+    asked = {"folder": machine.layout.trees, "hash": tree.hash, "label": "made", "files": files}
+    sent = Path(machine.layout.trees, ".blobs")
+    with machine.board() as board:
+        board.call("tree", asked)
+        board.call(
+            "blobs",
+            {
+                "folder": machine.layout.trees,
+                "blobs": [[hashlib.sha256(c).hexdigest(), len(c)] for c in contents.values()],
+            },
+            body=zlib.compress(b"".join(contents.values())),
+        )
+        inodes = {path.stat().st_ino for path in sent.iterdir()}
+        assert board.call("tree", asked).value == {"changed": True, "missing": []}
+
+    assert on_machine(machine, tree) == tree_files(tree)
+    assert list(sent.iterdir()) == []
+    there = {path.stat().st_ino for path in Path(machine.layout.tree(tree.hash)).glob("[fa]*")}
+    assert inodes < there and len(there) == len(inodes) + 1
+
+
+def test_one_content_with_two_modes_keeps_both(machine):
+    tree = made_tree(a=b"same", b=b"same")
+    program = dataclasses.replace(tree.files[0], mode=0o555)
+    tree = tree_of("made", [program, tree.files[1]])
+    with machine.board() as board:
+        send_tree(board, machine.layout, tree)
+
+    top = Path(machine.layout.tree(tree.hash))
+    assert [(top / name).stat().st_mode & 0o777 for name in "ab"] == [0o555, 0o444]
+    assert is_whole(machine, tree)
+
+
+@pytest.mark.parametrize("verb", ["blobs", "blob", "tree"])
+def test_full_disk_keeps_nothing_of_what_was_sent(tmp_path, monkeypatch, verb):
+    """Else what came before takes the room of every later try."""
+    sent = tmp_path / ".blobs"
+    sent.mkdir()
+    (sent / hashlib.sha256(b"same").hexdigest()).write_bytes(b"same")
+    (sent / ("0" * 64)).write_bytes(bytes(1000))
+
+    def refuse(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    tree = made_tree(a=b"same", b=b"same")
+    monkeypatch.setattr(onboard_trees.content_changes, "write_whole", refuse)
+    monkeypatch.setattr(onboard_trees.shutil, "copyfile", refuse)
+    monkeypatch.setattr(onboard_trees.os, "replace", refuse)
+    files = [[file.path, file.sha256, file.mode] for file in tree.files]
+    asked = {
+        "blobs": {"blobs": [[tree.files[0].sha256, 4]]},
+        "blob": {"sha256": tree.files[0].sha256, "size": 4, "offset": 0, "length": 4},
+        "tree": {"hash": tree.hash, "label": "made", "files": files},
+    }[verb]
+    request = VerbRequest(arguments={"folder": str(tmp_path), **asked}, body=zlib.compress(b"same"))
+
+    with pytest.raises(OSError, match="No space left"):
+        VERBS[verb](request)
+
+    assert os.listdir(tmp_path) == []
 
 
 def test_connection_cut_at_every_frame_is_repaired_by_the_next_call(machine, monkeypatch):
