@@ -15,6 +15,7 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
+from concurrent.futures.process import _RemoteTraceback
 from functools import partial
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -22,6 +23,8 @@ from typing import Any, cast
 
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.errors import ConfigurationError, MachineError, PluginError
+from madns_runtime.plain_values import LINE_CHARACTERS_MAX
+from madns_runtime.plugin.code_places import error_text, line_of
 from madns_runtime.plugin.context import clean_text, describe_exception
 from madns_runtime.plugin.isolation import call_plugin
 from madns_runtime.plugin.registry import load_function
@@ -102,7 +105,7 @@ def _start_worker(parent: int) -> None:
 
 class JobFailed(PluginError):
     """
-    A submitted function raised; the text says which, what and where.
+    A submitted function raised, or it or its value cannot travel; the text says which, what and where.
 
     It travels back instead of the exception itself, whose traceback stays in the worker and which may
     not even be picklable.
@@ -128,24 +131,62 @@ def run_job(function: Callable[..., Any], *arguments: Any) -> Any:
             os._exit(0)
 
 
+def describe_failed_job(error: BaseException, doing: str) -> str:
+    """Say why a job, called *doing*, has no value: it raised, or cannot travel, or its executor works no more."""
+    if isinstance(error, BrokenExecutor):
+        return f"{doing}: {describe_broken(error)}"
+    if isinstance(error, JobFailed):
+        return f"{doing}: {error}"
+    if isinstance(
+        error.__cause__, _RemoteTraceback
+    ):  # raised behind the job, in a worker of a pool
+        return f"{doing}: {describe_unsent_value(error)}"
+    return describe_exception(error, doing)
+
+
 def describe_broken(error: BrokenExecutor) -> str:
     """Say why an executor works no more: a worker has died, or what a job returned cannot be unpacked."""
     told = str(error.__cause__ or "").strip().removesuffix("'''").strip().rpartition("\n")[2]
     return f"what it returned cannot be unpacked: {clean_text(told)}" if told else WORKER_DIED
 
 
-def pack_job(function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes | None:
+def describe_unsent_job(function: Callable[..., Any], error: BaseException) -> str:
+    """Say that a job has no form in which it reaches a worker, and what has one."""
+    name, line = getattr(function, "__qualname__", repr(function)), line_of(function)
+    return (
+        f"{name}{line and f' ({line})'} cannot be sent to a worker ({_reason(error)}); give submit a function at the"
+        " top of a module and plain arguments"
+    )
+
+
+def describe_unsent_value(error: BaseException) -> str:
+    """Say that what a job returned has no form in which it reaches the host, and what has one."""
+    return (
+        f"what it returned cannot be sent back ({_reason(error)}); return plain values, arrays, or instances of classes"
+        " at the top of a module"
+    )
+
+
+def _reason(error: BaseException) -> str:
+    text = clean_text(error_text(error)).partition("\n")[0][:LINE_CHARACTERS_MAX]
+    return text or type(error).__name__
+
+
+def pack_job(function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
     """
-    Return a job as it is now; None if a part of it has no such form, as a lock has none.
+    Return a job as it is now.
 
     A pool encodes what it is given later, in a thread of its own: what the submitter changes meanwhile, such as an
     array of states, would reach the job or not, whichever is first.
+
+    Raises:
+        JobFailed: A part of it has no such form, as a lock has none.
     """
     buffer = io.BytesIO()
     try:
         ForkingPickler(buffer, 5).dump((function, arguments))
-    except Exception:  # noqa: BLE001 - classes of a plug-in may raise anything; an executor that needs this form says so
-        return None
+    except Exception as error:  # classes of a plug-in may raise anything
+        raise JobFailed(describe_unsent_job(function, error)) from error
     return buffer.getvalue()
 
 
@@ -213,11 +254,17 @@ class JobRunner:
         return job
 
     def _start(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Future[Any]:
-        if not getattr(self._executor, "packs_at_once", False):
+        if getattr(self._executor, "packs_at_once", False):
+            return self._executor.submit(run_job, function, *arguments)
+        try:
             packed = pack_job(function, arguments)
-            if packed is not None:
-                return self._executor.submit(run_packed_job, packed)
-        return self._executor.submit(run_job, function, *arguments)
+        except JobFailed as error:
+            if type(self._executor) is not ProcessPoolExecutor:  # threads share it
+                return self._executor.submit(run_job, function, *arguments)
+            unsent: Future[Any] = Future()
+            unsent.set_exception(error)
+            return unsent
+        return self._executor.submit(run_packed_job, packed)
 
     def tell_dropped(self, log: Callable[[str, str], None]) -> None:
         """Say how many jobs are not done now that simulated time is over: their values come too late."""
