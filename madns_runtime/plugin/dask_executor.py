@@ -21,7 +21,7 @@ import madns_runtime
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.errors import ConfigurationError, MachineError, MissingExtraError
 from madns_runtime.plugin.code_places import MODULE_PREFIX
-from madns_runtime.plugin.executor import (
+from madns_runtime.plugin.jobs import (
     JobFailed,
     describe_unsent_job,
     describe_unsent_value,

@@ -25,8 +25,8 @@ from madns_runtime.plain_values import OwnCopies
 from madns_runtime.plugin import time_limit, validation
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation
 from madns_runtime.plugin.context import clean_text, describe_exception
-from madns_runtime.plugin.executor import describe_failed_job
 from madns_runtime.plugin.host_calls import HostCalls
+from madns_runtime.plugin.jobs import describe_failed_job
 from madns_runtime.plugin.registry import Role, load_function, load_half, parse_parameters, resolve
 from madns_runtime.processes import own_age_s
 from madns_runtime.protocol.messages import Service, Transmission

@@ -23,14 +23,8 @@ from harness.waiting import wait_until
 
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.errors import ConfigurationError, MachineError, MissingExtraError
-from madns_runtime.plugin.executor import (
-    JobFailed,
-    JobRunner,
-    describe_broken,
-    describe_failed_job,
-    make_executor,
-    run_job,
-)
+from madns_runtime.plugin.executor import JobRunner, make_executor
+from madns_runtime.plugin.jobs import JobFailed, describe_broken, describe_failed_job, run_job
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator

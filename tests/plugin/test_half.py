@@ -19,8 +19,8 @@ from madns_runtime.medium.links import LinkMedium
 from madns_runtime.medium.outcomes import LinkOutcome
 from madns_runtime.plugin import validation
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation
-from madns_runtime.plugin.executor import JobFailed
 from madns_runtime.plugin.half import Half, HalfFailed, HostHalf, RoleProgram
+from madns_runtime.plugin.jobs import JobFailed
 from madns_runtime.protocol.codec import DEPTH_MAX, ITEMS_MAX, decode_message, encode_message
 from madns_runtime.protocol.messages import (
     Delivery,
