@@ -23,7 +23,8 @@ from datetime import UTC, datetime
 import numpy as np
 
 from madns_runtime.config import ExecutorSettings
-from madns_runtime.plugin.executor import make_executor, run_job
+from madns_runtime.plugin.executor import make_executor
+from madns_runtime.plugin.jobs import run_job
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.parameters import (
     BasiliskPropagator,

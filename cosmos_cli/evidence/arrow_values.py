@@ -8,6 +8,7 @@ call imports pyarrow.compute, a tenth of what a short run's command costs.
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterable
 from typing import Any
@@ -28,6 +29,7 @@ ARROW_TYPES: dict[Kind, pa.DataType] = {
     "json": pa.string(),
     "packed": pa.string(),
 }
+NO_PLACES = np.empty(0, np.intp)
 
 
 class _NoPandas:
@@ -58,20 +60,20 @@ def _leave_pandas_out() -> None:
 _leave_pandas_out()
 
 
-def to_arrow(values: NDArray[Any], kind: Kind) -> tuple[pa.Array, int]:
-    """Return a column as its field's kind wants it, and how many values did not fit and became null."""
+def to_arrow(values: NDArray[Any], kind: Kind) -> tuple[pa.Array, NDArray[np.intp]]:
+    """Return a column as its field's kind wants it, and the places of those values that did not fit and became null."""
     if kind == "float" and values.dtype.kind in "fi":
-        return floats_array(values), 0
+        return floats_array(values), NO_PLACES
     if kind == "int" and values.dtype.kind == "i":
-        return numbers_array(values.astype(np.int64, copy=False)), 0
+        return numbers_array(values.astype(np.int64, copy=False)), NO_PLACES
     if kind == "bool" and values.dtype.kind == "b":
-        return _of_buffer(pa.bool_(), len(values), _bits(values), None), 0
+        return _of_buffer(pa.bool_(), len(values), _bits(values), None), NO_PLACES
     if kind == "int" and values.dtype.kind == "f":
         is_null = np.isnan(values)
         is_beyond = (values >= 2.0**63) | (values < -(2.0**63))
         is_unfit = ~is_null & ((values != np.floor(values)) | is_beyond)
         whole = np.where(is_null | is_unfit, 0, values).astype(np.int64)
-        return numbers_array(whole, is_null=is_null | is_unfit), int(is_unfit.sum())
+        return numbers_array(whole, is_null=is_null | is_unfit), np.flatnonzero(is_unfit)
     return _convert_each(values.tolist(), kind)
 
 
@@ -148,15 +150,20 @@ def as_floats(values: NDArray[Any]) -> NDArray[np.float64]:
     return np.array(numbers, dtype=np.float64)
 
 
-def _convert_each(values: list[Any], kind: Kind) -> tuple[pa.Array, int]:
-    converted = [_convert(value, kind) for value in values]
-    unfit = sum(new is None and old is not None for old, new in zip(values, converted, strict=True))
-    return pa.array(converted, type=ARROW_TYPES[kind]), unfit
+def _convert_each(values: list[Any], kind: Kind) -> tuple[pa.Array, NDArray[np.intp]]:
+    converted = [None if _is_null(value) else _convert(value, kind) for value in values]
+    is_unfit = [
+        new is None and not _is_null(old) for old, new in zip(values, converted, strict=True)
+    ]
+    return pa.array(converted, type=ARROW_TYPES[kind]), np.flatnonzero(is_unfit)
+
+
+def _is_null(value: Any) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
 
 
 def _convert(value: Any, kind: Kind) -> Any:
-    if value is None or (isinstance(value, float) and np.isnan(value)):
-        return None
+    """Return a value as its kind has it; None where it is of another."""
     if kind == "float":
         return float(value) if is_real(value) else None
     if kind == "int":
@@ -164,7 +171,9 @@ def _convert(value: Any, kind: Kind) -> Any:
         return int(value) if is_int64 else None
     if kind == "bool":
         return value if isinstance(value, bool) else None
+    if isinstance(value, str) or kind == "str":
+        return value if isinstance(value, str) else None
     try:
-        return value if isinstance(value, str) else json.dumps(value)
+        return json.dumps(value)
     except RecursionError:  # orjson reads what is nested deeper than Python goes
         return None

@@ -7,6 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from cosmos_cli.evidence.verdict import CheckResult, is_number
+from cosmos_cli.ui.foreign_text import clean_line
+from madns_runtime.plain_values import LINE_CHARACTERS_MAX, is_line
 
 
 def plugin_checks(summaries: Mapping[str, Mapping[str, Any]]) -> list[CheckResult]:
@@ -46,7 +48,7 @@ def _parse_check(item: Any, who: str) -> CheckResult:
         limit=item["limit"],
         got=got if is_number(got) else None,
         passed=is_number(got) and item["passed"],
-        worst=told if isinstance(told, str) and told else who,
+        worst=told if told and is_line(told) else who,
     )
 
 
@@ -59,12 +61,15 @@ def listed_checks(summary: Mapping[str, Any]) -> Sequence[Any]:
 def check_fault(item: Any) -> str:
     """Return why an entry of a summary's checks is none; empty if it is one."""
     if not isinstance(item, Mapping):
-        return (
-            f"expected a list of mappings, got {item if isinstance(item, str) else repr(item):.80}"
-        )
+        text = clean_line(item if isinstance(item, str) else repr(item), length_max=80)
+        return f"expected a list of mappings, got {text}"
     name, limit, got, passed = (item.get(key) for key in ("name", "limit", "got", "passed"))
     for key, is_fit, wanted in (
-        ("name", isinstance(name, str) and name, "a name"),
+        (
+            "name",
+            name and is_line(name),
+            f"a name of at most {LINE_CHARACTERS_MAX} printable characters",
+        ),
         ("limit", is_number(limit), "a finite number"),
         ("got", is_number(got) or got is None or isinstance(got, float), "a number"),
         ("passed", isinstance(passed, bool), "true or false"),

@@ -36,9 +36,11 @@ from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import Columns, RecordFile
 from cosmos_cli.evidence.table_labels import NEVER_US
 from cosmos_cli.evidence.table_layout import METADATA_KEY, TableLayout, in_unit
+from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.analysis.tables import AGENT, INCARNATION, RecordedRun
 from madns_runtime.conditions.condition import TIME
 from madns_runtime.partial_file import create_partial
+from madns_runtime.plain_values import shown
 from madns_runtime.recording.columns import joined_column
 from madns_runtime.recording.records import Field
 
@@ -62,8 +64,8 @@ class TableWriter:
 
     def __init__(self, path: Path, layout: TableLayout) -> None:
         self.path = path
-        self.unfit = 0
-        """Values that do not fit their field's kind and are null here."""
+        self.unfit: dict[str, tuple[int, str]] = {}
+        """Values that are not of their field's kind and are null here, by its name and kind: how many, and the first."""
         self.foreign: dict[str, int] = {}
         """Values in a unit that does not convert to their column's and that are null here, by a word on whose they are."""
         self.rows = 0
@@ -131,10 +133,18 @@ class TableWriter:
         if layout.label:
             arrays.append(self._labels(file, joined.get(AGENT), count))
         for field in layout.fields:
-            array, unfit = to_arrow(joined[field.name], field.kind)
+            values = joined[field.name]
+            array, places = to_arrow(values, field.kind)
             arrays.append(array)
-            self.unfit += unfit
+            if len(places):
+                self._count_unfit(file, field, values[places].tolist())
         return pa.Table.from_arrays(arrays, schema=self._schema)
+
+    def _count_unfit(self, file: RecordFile, field: Field, values: list[Any]) -> None:
+        about = f"{clean_line(field.name)} ({field.kind})"
+        count, first = self.unfit.get(about, (0, ""))
+        first = first or f"{shown(values[0])} of {clean_line(file.source)}"
+        self.unfit[about] = (count + len(values), first)
 
     def _column(self, file: RecordFile, field: Field, count: int) -> NDArray[Any]:
         """Return what is held of a field, in its column's unit."""
@@ -142,7 +152,8 @@ class TableWriter:
         unit = next((own.unit for own in file.fields if own.name == field.name), field.unit)
         values, lost = in_unit(values, unit, field, self._layout.role)
         if lost:
-            told = f"{field.name} of {file.source} is in {unit or '1'}, the table's in {field.unit or '1'}"
+            whose = f"{clean_line(field.name)} of {clean_line(file.source)}"
+            told = f"{whose} is in {clean_line(unit) or '1'}, the table's in {clean_line(field.unit) or '1'}"
             self.foreign[told] = self.foreign.get(told, 0) + lost
         return values
 

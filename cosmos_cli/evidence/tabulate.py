@@ -31,8 +31,8 @@ Progress = Callable[[str, float], None]
 """Takes what is being done and how far it is, 0 to 1."""
 Layout = Callable[[Sequence[RecordFile]], TableLayout]
 """Lays out the table of some streams."""
-FOREIGN_TOLD_MAX = 3
-"""Fields of agents in units that do not convert, each told."""
+LOST_TOLD_MAX = 3
+"""Fields of a table with values that are not of their kind, and fields of agents in units that do not convert, each told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,9 +159,14 @@ class _Table:
 
 def _lost(writer: TableWriter) -> str | None:
     """Return which recorded values a table does not hold; None if it holds all."""
-    unfit = "recorded values are not of their field's kind and are null"
-    told = [f"{writer.unfit} {unfit}"] if writer.unfit else []
+    unfit = [
+        f"{number} values of {field} are null: not of their kind, first {first}"
+        for field, (number, first) in writer.unfit.items()
+    ]
     foreign = [f"{place}: {number} values are null" for place, number in writer.foreign.items()]
-    if (more := len(foreign) - FOREIGN_TOLD_MAX) > 0:
-        foreign[FOREIGN_TOLD_MAX:] = [f"so are those of {more} more"]
-    return "; ".join([*told, *foreign]) or None
+    return "; ".join([*_first_lost(unfit), *_first_lost(foreign)]) or None
+
+
+def _first_lost(told: list[str]) -> list[str]:
+    more = len(told) - LOST_TOLD_MAX
+    return [*told[:LOST_TOLD_MAX], f"so are those of {more} more"] if more > 0 else told

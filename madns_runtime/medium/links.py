@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from hashlib import blake2b
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from madns_runtime.errors import PluginError
@@ -163,9 +164,9 @@ class LinkMedium:
             barrier: Any = self._reach(sender, receiver, leaves_s) if self._reach else None
             if barrier is not None and not _is_reason(barrier):
                 raise PluginError(
-                    f"reach({sender!r}, {receiver!r}, {leaves_s:g}) returned {shown(barrier)}: expected None if the"
-                    " receiver can receive it, else why not, in a word such as 'out_of_range' other than"
-                    f" {DELIVERED!r} and {LOST!r}"
+                    f"reach({sender!r}, {receiver!r}, {leaves_s:g}){_of_line(self._reach)} returned {shown(barrier)}:"
+                    " expected None if the receiver can receive it, else why not, in a word such as 'out_of_range'"
+                    f" other than {DELIVERED!r} and {LOST!r}"
                 )
             if barrier and to == EVERYBODY:
                 continue
@@ -179,8 +180,8 @@ class LinkMedium:
                     delay_s = delay_s(sender, receiver, leaves_s)
                     if not _is_positive(delay_s):
                         raise PluginError(
-                            f"delay_s({sender!r}, {receiver!r}, {leaves_s:g}) returned {shown(delay_s)}: expected"
-                            " seconds, more than 0"
+                            f"delay_s({sender!r}, {receiver!r}, {leaves_s:g}){_of_line(self._delay_s)} returned"
+                            f" {shown(delay_s)}: expected seconds, more than 0"
                         )
                 # A delay may be less than what tells two times apart.
                 arrives_s = max(leaves_s + duration_s + delay_s, math.nextafter(sent_s, math.inf))
@@ -237,6 +238,12 @@ def _shown_answer(value: Any) -> str:
     """Return an answer for a message; of a function its name and what it takes."""
     name = getattr(value, "__qualname__", None)
     return f"{name}{inspect.signature(value)}" if name and callable(value) else shown(value)
+
+
+def _of_line(function: Any) -> str:
+    """Return " of FILE:LINE" where a function of Python is written; empty of anything else."""
+    code = getattr(function, "__code__", None)
+    return f" of {Path(code.co_filename).name}:{code.co_firstlineno}" if code is not None else ""
 
 
 def _is_reason(value: Any) -> bool:

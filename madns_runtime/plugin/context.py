@@ -233,12 +233,13 @@ def describe_exception(
     if called is not None and not frames[1:]:
         place = line_of(called)
     elif frames:
-        # A medium of the framework's calls the plug-in, too.
+        # A medium of the framework's calls the plug-in, too, and refuses what that returns: this says whose it is.
         outside = [frame for frame in frames[1:] if not _is_framework(Path(frame.filename))]
         home = Path((outside or frames[1:] or frames)[0].filename).parent
         own = [frame for frame in frames[1:] if _is_below(Path(frame.filename), home)]
         frame = own[-1] if own else frames[-1]
-        place = f"{Path(frame.filename).name}:{frame.lineno}"
+        if outside or not isinstance(error, PluginError):
+            place = f"{Path(frame.filename).name}:{frame.lineno}"
     first, *rest = clean_text(error_text(error).strip()).splitlines() or [""]
     if len(first) > LINE_CHARACTERS_MAX:
         first = f"{first[:LINE_CHARACTERS_MAX]} [cut]"

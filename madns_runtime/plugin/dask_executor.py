@@ -21,6 +21,12 @@ import madns_runtime
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.errors import ConfigurationError, MachineError, MissingExtraError
 from madns_runtime.plugin.code_places import MODULE_PREFIX
+from madns_runtime.plugin.jobs import (
+    JobFailed,
+    describe_unsent_job,
+    describe_unsent_value,
+    run_job,
+)
 from madns_runtime.reactor.scheduling import die_with_parent
 from madns_runtime.timing.granted_clock import repeat_until_granted
 
@@ -106,7 +112,8 @@ class DaskExecutor(Executor):
         try:
             packed = dumps(functools.partial(fn, *args, **kwargs))
         except Exception as error:  # noqa: BLE001 - classes of a plug-in may raise anything
-            outer.set_exception(error)
+            function = args[0] if fn is run_job else fn
+            outer.set_exception(JobFailed(describe_unsent_job(function, error)))
             return outer
         inner = self._executor.submit(_do, packed)
         inner.add_done_callback(lambda done: self._pass_on(done, outer))
@@ -178,7 +185,10 @@ def dask_setup(worker: Any) -> None:
 def _do(packed: bytes) -> Any:
     """Do a job in a worker; a value that cannot travel is its failure, where Dask would try for ever."""
     value = loads(packed)()
-    dumps(value, buffer_callback=lambda _: None)  # arrays are not copied
+    try:
+        dumps(value, buffer_callback=lambda _: None)  # arrays are not copied
+    except Exception as error:  # classes of a plug-in may raise anything
+        raise JobFailed(describe_unsent_value(error)) from error
     return value
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import multiprocessing
 import os
 import signal
@@ -16,14 +15,13 @@ from concurrent.futures import (
     ThreadPoolExecutor,
 )
 from functools import partial
-from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any, cast
 
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.errors import ConfigurationError, MachineError, PluginError
-from madns_runtime.plugin.context import clean_text, describe_exception
 from madns_runtime.plugin.isolation import call_plugin
+from madns_runtime.plugin.jobs import WORKER_DIED, JobFailed, pack_job, run_job, run_packed_job
 from madns_runtime.plugin.registry import load_function
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.reactor.scheduling import die_with_parent
@@ -31,7 +29,6 @@ from madns_runtime.timing.granted_clock import repeat_until_granted
 
 JOBS_MAX = 10_000
 """Jobs submitted and not yet taken back."""
-WORKER_DIED = "a worker of the executor has died: was it killed, or is memory short?"
 START_TIMEOUT_S = 30.0
 """Time for the workers of a pool of our own to be there; waits for a processor do not count."""
 START_CHECK_S = 0.5
@@ -100,69 +97,6 @@ def _start_worker(parent: int) -> None:
     signal.set_wakeup_fd(-1)
 
 
-class JobFailed(PluginError):
-    """
-    A submitted function raised; the text says which, what and where.
-
-    It travels back instead of the exception itself, whose traceback stays in the worker and which may
-    not even be picklable.
-    """
-
-
-def run_job(function: Callable[..., Any], *arguments: Any) -> Any:
-    """
-    Do one job, in a worker.
-
-    Raises:
-        JobFailed: The function raised.
-    """
-    worker = os.getpid()
-    try:
-        return function(*arguments)
-    except BaseException as error:  # a plug-in may raise anything
-        name = getattr(function, "__qualname__", repr(function))
-        raise JobFailed(describe_exception(error, name, function)) from error
-    finally:
-        # One that it forked would answer, too, and take the next jobs.
-        if os.getpid() != worker:
-            os._exit(0)
-
-
-def describe_broken(error: BrokenExecutor) -> str:
-    """Say why an executor works no more: a worker has died, or what a job returned cannot be unpacked."""
-    told = str(error.__cause__ or "").strip().removesuffix("'''").strip().rpartition("\n")[2]
-    return f"what it returned cannot be unpacked: {clean_text(told)}" if told else WORKER_DIED
-
-
-def pack_job(function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes | None:
-    """
-    Return a job as it is now; None if a part of it has no such form, as a lock has none.
-
-    A pool encodes what it is given later, in a thread of its own: what the submitter changes meanwhile, such as an
-    array of states, would reach the job or not, whichever is first.
-    """
-    buffer = io.BytesIO()
-    try:
-        ForkingPickler(buffer, 5).dump((function, arguments))
-    except Exception:  # noqa: BLE001 - classes of a plug-in may raise anything; an executor that needs this form says so
-        return None
-    return buffer.getvalue()
-
-
-def run_packed_job(packed: bytes) -> Any:
-    """
-    Do one job that `pack_job` has packed in the host's process, in a worker.
-
-    Raises:
-        JobFailed: The function raised, or cannot be found here.
-    """
-    try:
-        function, arguments = ForkingPickler.loads(packed)
-    except BaseException as error:  # an import may raise anything
-        raise JobFailed(describe_exception(error, "unpacking the job")) from error
-    return run_job(function, *arguments)
-
-
 class JobRunner:
     """
     Hands functions to an executor and their results to the loop.
@@ -213,11 +147,17 @@ class JobRunner:
         return job
 
     def _start(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Future[Any]:
-        if not getattr(self._executor, "packs_at_once", False):
+        if getattr(self._executor, "packs_at_once", False):
+            return self._executor.submit(run_job, function, *arguments)
+        try:
             packed = pack_job(function, arguments)
-            if packed is not None:
-                return self._executor.submit(run_packed_job, packed)
-        return self._executor.submit(run_job, function, *arguments)
+        except JobFailed as error:
+            if type(self._executor) is not ProcessPoolExecutor:  # threads share it
+                return self._executor.submit(run_job, function, *arguments)
+            unsent: Future[Any] = Future()
+            unsent.set_exception(error)
+            return unsent
+        return self._executor.submit(run_packed_job, packed)
 
     def tell_dropped(self, log: Callable[[str, str], None]) -> None:
         """Say how many jobs are not done now that simulated time is over: their values come too late."""

@@ -25,8 +25,8 @@ from madns_runtime.plain_values import OwnCopies
 from madns_runtime.plugin import time_limit, validation
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation
 from madns_runtime.plugin.context import clean_text, describe_exception
-from madns_runtime.plugin.executor import JobFailed, describe_broken
 from madns_runtime.plugin.host_calls import HostCalls
+from madns_runtime.plugin.jobs import describe_failed_job
 from madns_runtime.plugin.registry import Role, load_function, load_half, parse_parameters, resolve
 from madns_runtime.processes import own_age_s
 from madns_runtime.protocol.messages import Service, Transmission
@@ -393,8 +393,6 @@ class HostHalf(Half):
         if (error := future.exception()) is None:
             self.call("result", job, future.result())
             return
-        if isinstance(error, BrokenExecutor):
-            raise HalfFailed(f"{doing}: {describe_broken(error)}")
-        self._log("critical", "".join(traceback.format_exception(error)))
-        is_told = isinstance(error, JobFailed)
-        raise HalfFailed(f"{doing}: {error}" if is_told else describe_exception(error, doing))
+        if not isinstance(error, BrokenExecutor):
+            self._log("critical", "".join(traceback.format_exception(error)))
+        raise HalfFailed(describe_failed_job(error, doing))

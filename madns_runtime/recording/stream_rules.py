@@ -18,6 +18,11 @@ DETAILS: Final = "details"
 TABLES_TAKEN: Final = ("host_", "machine_")
 """Beginnings of the names of other tables than those of agents' streams."""
 DIGITS_MAX: Final = 15
+UNITS_HELD: Final = {
+    "t_s": (("s",), "simulated time in seconds", "call a time in another unit otherwise"),
+    "tick": (("", "1"), "the number of a tick, without a unit", "call anything else otherwise"),
+}
+"""Units of the numbers by which checks, conditions and tables know when a record is of, what these are, and what else to do."""
 
 
 def check_name(name: Any) -> None:
@@ -101,7 +106,7 @@ def check_field(stream: str, field: Field) -> None:
 
     Raises:
         PluginError: Its name or unit is no text that can be written, tables have a column of that name for
-            themselves, it has no such number of digits, or its words are no texts.
+            themselves, it is a time or a tick in another unit, it has no such number of digits, or its words are no texts.
     """
     name: Any = field.name
     unit: Any = field.unit
@@ -115,6 +120,9 @@ def check_field(stream: str, field: Field) -> None:
             f"stream {stream}: expected the unit of {name} to be a text of at most {LINE_CHARACTERS_MAX} printable"
             f" characters, got {shown(unit)}"
         )
+    units, meaning, cure = UNITS_HELD.get(name, ((unit,), "", ""))
+    if field.kind in ("float", "int") and unit not in units:
+        raise PluginError(f"stream {stream}: {name} is {meaning}, got unit {unit!r}; {cure}")
     places: Any = field.digits
     if places is not None and not (is_whole(places) and 0 <= places <= DIGITS_MAX):
         raise PluginError(

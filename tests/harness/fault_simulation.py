@@ -10,7 +10,7 @@ from madns_runtime.recording.records import Field
 
 PERIOD_S = 0.1
 SERVICES = (Service.BEST, Service.RELIABLE, Service.SYNC)
-HEARD = (Field("t_s"), Field("who", "", "str"), Field("what", "", "json"))
+HEARD = (Field("t_s", "s"), Field("who", "", "str"), Field("what", "", "json"))
 
 
 class FaultHost(HostSimulation):
@@ -53,7 +53,7 @@ class FaultAgent(AgentSimulation):
         self.context = context
         self.heard = Counter()
         context.open_stream("heard", HEARD)
-        context.open_stream("steps", (Field("t_s"), Field("tick", "", "int")))
+        context.open_stream("steps", (Field("t_s", "s"), Field("tick", "", "int")))
 
     def step(self, tick):
         if tick.index >= 20 and self.context.name == self.context.parameters.dies:

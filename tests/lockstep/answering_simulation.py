@@ -16,7 +16,7 @@ class Host(HostSimulation):
     def setup(self, context):
         self.context = context
         context.open_stream(
-            "heard", (Field("t_s"), Field("who", "", "str"), Field("what", "", "str"))
+            "heard", (Field("t_s", "s"), Field("who", "", "str"), Field("what", "", "str"))
         )
 
     def receive(self, agent, message):

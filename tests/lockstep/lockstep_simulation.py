@@ -73,7 +73,7 @@ class Host(HostSimulation):
         self.fault = context.parameters.fault
         self.meets("hostsetup")
         context.open_stream(
-            "heard", (Field("t_s"), Field("who", "", "str"), Field("what", "", "json"))
+            "heard", (Field("t_s", "s"), Field("who", "", "str"), Field("what", "", "json"))
         )
         for number in range(6):
             context.submit(square, number)
@@ -147,7 +147,7 @@ class Agent(AgentSimulation):
         self.context = context
         self.number = initial["number"]
         self.meets("setup")
-        context.open_stream("own", (Field("t_s"), Field("what", "", "json")))
+        context.open_stream("own", (Field("t_s", "s"), Field("what", "", "json")))
         context.send(HOST, ["set up", context.is_lockstep])
 
     def meets(self, place):

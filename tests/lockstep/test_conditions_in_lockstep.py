@@ -26,12 +26,12 @@ class Host(Half, HostSimulation):
     stream = "of_host"
     def setup(self, context):
         self.context = context
-        context.open_stream(self.stream, (Field("t_s"), Field("value")))
+        context.open_stream(self.stream, (Field("t_s", "s"), Field("value")))
 class Agent(Half, AgentSimulation):
     stream = "of_agents"
     def setup(self, context, initial):
         self.context = context
-        context.open_stream(self.stream, (Field("t_s"), Field("value")))
+        context.open_stream(self.stream, (Field("t_s", "s"), Field("value")))
 simulation = Simulation(name="finishing", parameters=Parameters, host=":Host", agent=":Agent")
 """
 

@@ -494,7 +494,8 @@ def test_a_reach_that_answers_yes_or_no_is_told_what_to_return(answer):
     )
 
     with pytest.raises(
-        PluginError, match=r"reach\('car-1', 'car-2', 0\) returned .* expected None if"
+        PluginError,
+        match=r"reach\('car-1', 'car-2', 0\) of test_medium\.py:\d+ returned .* expected None if",
     ):
         medium.carry("car-1", Transmission("car-2", 0, 0.0, PAYLOAD))
 
@@ -506,7 +507,8 @@ def test_a_delay_that_is_none_is_told_with_whom_it_was_asked_for(answer):
     )
 
     with pytest.raises(
-        PluginError, match=r"delay_s\('car-1', 'car-2', 0\) returned .* expected sec"
+        PluginError,
+        match=r"delay_s\('car-1', 'car-2', 0\) of test_medium\.py:\d+ returned .* expected sec",
     ):
         medium.carry("car-1", Transmission("car-2", 0, 0.0, PAYLOAD))
 

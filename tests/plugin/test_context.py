@@ -13,8 +13,8 @@ import pytest
 from madns_runtime.config import Agents
 from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.plugin.context import JobContext, check_sending, describe_exception
-from madns_runtime.plugin.executor import JobFailed, run_job
 from madns_runtime.plugin.isolation import said
+from madns_runtime.plugin.jobs import JobFailed, run_job
 from madns_runtime.protocol.messages import Service, Transmission
 from madns_runtime.recording.run_journal import RunJournal
 

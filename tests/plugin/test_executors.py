@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -22,13 +23,8 @@ from harness.waiting import wait_until
 
 from madns_runtime.config import ExecutorSettings
 from madns_runtime.errors import ConfigurationError, MachineError, MissingExtraError
-from madns_runtime.plugin.executor import (
-    JobFailed,
-    JobRunner,
-    describe_broken,
-    make_executor,
-    run_job,
-)
+from madns_runtime.plugin.executor import JobRunner, make_executor
+from madns_runtime.plugin.jobs import JobFailed, describe_broken, describe_failed_job, run_job
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.parameters import ScipyPropagator
@@ -160,6 +156,42 @@ def test_a_job_that_cannot_be_copied_is_shared_with_threads():
     assert found == [True]
 
 
+def failure_of(function, *arguments):
+    """Return what the host tells of a job that fails in a pool of processes."""
+    executor = make_executor(ExecutorSettings(kind="process", workers=1))
+    reactor, found = Reactor(), []
+
+    def done(job, future):
+        found.append(describe_failed_job(future.exception(), f"job {job}"))
+        reactor.stop()
+
+    runner = JobRunner(reactor, executor, done)
+    runner.submit(function, *arguments)
+    reactor.call_at(reactor.now_s() + PATIENCE_S, reactor.stop)
+    reactor.run()
+    runner.close()
+    return found[0]
+
+
+def test_a_job_that_cannot_be_sent_to_a_process_is_told_with_its_own_line():
+    told = failure_of(lambda: 1)
+
+    assert re.fullmatch(
+        r"job 1: test_a_job\w+\.<locals>\.<lambda> \(test_executors\.py:\d+\) cannot be sent to a worker"
+        r" \(Can't pickle .*\); give submit a function at the top of a module and plain arguments",
+        told,
+    )
+    assert "lock" in failure_of(id, threading.Lock())
+
+
+def test_a_value_that_cannot_be_sent_back_from_a_process_is_told_as_such():
+    assert re.fullmatch(
+        r"job 1: what it returned cannot be sent back \(cannot pickle '_thread\.lock' object\); return plain values.*",
+        failure_of(threading.Lock),
+    )
+    assert failure_of(math.fmod, 1.0, 0.0).startswith("job 1: fmod raised ValueError")
+
+
 def left_since(before):
     """Return the processes that were begun and live; multiprocessing's tracker of resources ends with this one."""
     found = []
@@ -196,10 +228,10 @@ def test_a_job_that_raises_says_what_and_where(cluster):
 
 def test_what_cannot_travel_fails_its_job_instead_of_never_coming_back(cluster):
     executor = connected(cluster)
-    with pytest.raises(TypeError, match="cannot pickle"):
+    with pytest.raises(JobFailed, match=r"^what it returned cannot be sent back \(.*lock"):
         executor.submit(threading.Lock).result(PATIENCE_S)
-    with pytest.raises(TypeError, match="[Cc]ould not serialize|cannot pickle"):
-        executor.submit(id, threading.Lock()).result(PATIENCE_S)
+    with pytest.raises(JobFailed, match=r"^id cannot be sent to a worker \(.*lock"):
+        executor.submit(run_job, id, threading.Lock()).result(PATIENCE_S)
     executor.shutdown()
 
 

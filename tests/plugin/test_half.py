@@ -7,6 +7,7 @@ import dataclasses
 import enum
 import math
 from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,8 @@ from madns_runtime.medium.links import LinkMedium
 from madns_runtime.medium.outcomes import LinkOutcome
 from madns_runtime.plugin import validation
 from madns_runtime.plugin.api import AgentSimulation, HostSimulation
-from madns_runtime.plugin.executor import JobFailed
 from madns_runtime.plugin.half import Half, HalfFailed, HostHalf, RoleProgram
+from madns_runtime.plugin.jobs import JobFailed
 from madns_runtime.protocol.codec import DEPTH_MAX, ITEMS_MAX, decode_message, encode_message
 from madns_runtime.protocol.messages import (
     Delivery,
@@ -580,6 +581,33 @@ def test_what_a_reach_raises_is_told_with_its_own_line(logged):
     half.set_up(None)
 
     with pytest.raises(HalfFailed, match=r"raised ValueError: no map \(test_half.py:\d+\)$"):
+        half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
+
+
+def never(*way: Any) -> float:
+    return -1.0
+
+
+@pytest.mark.parametrize(
+    ("answers", "told"),
+    [
+        (
+            {"delay_s": 1.0, "reach": never},
+            r"reach\('a', 'b', 1\) of test_half\.py:LINE returned -1.0",
+        ),
+        ({"delay_s": never}, r"delay_s\('a', 'b', 1\) of test_half\.py:LINE returned -1.0"),
+        ({"delay_s": partial(min, 0.0, key=str)}, r"delay_s\('a', 'b', 1\) returned 0.0"),
+    ],
+)
+def test_what_a_function_of_a_medium_returns_wrongly_is_told_with_its_own_line(
+    logged, answers, told
+):
+    air = LinkMedium(("a", "b"), np.random.default_rng(1), **answers)
+    half = made(Base, logged, HostHalf, lambda host, context: air)
+    half.set_up(None)
+    told = told.replace("LINE", str(never.__code__.co_firstlineno))
+
+    with pytest.raises(HalfFailed, match=rf"PluginError: {told}: expected [^:]*$"):
         half.take("a", Transmission(to="b", number=0, sent_s=1.0, payload=None))
 
 

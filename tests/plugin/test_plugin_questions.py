@@ -330,6 +330,10 @@ def test_every_faulty_part_of_a_file_is_told_with_its_line_and_not_with_a_module
         ("name='x', fields=(F('x_m', digits='3'),)", "expected digits, 0 to 15"),
         ("name='x', fields=(F('x_m'), F('x_m'))", "expected fields with distinct names"),
         ("name='x', fields=(F('x_m'),), is_open='no'", "DeclaredStream.is_open: expected bool"),
+        (
+            "name='x', fields=(F('t_s', 'ms'),)",
+            "stream x: t_s is simulated time in seconds, got unit 'ms'",
+        ),
     ],
 )
 def test_a_declared_stream_that_could_not_be_opened_is_told_before_the_run(plugin, stream, told):

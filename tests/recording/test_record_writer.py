@@ -171,6 +171,23 @@ def test_fields_of_no_kind_are_refused(tmp_path, field):
         make_recorder(tmp_path).open_stream(StreamSchema("s", (field,)))
 
 
+@pytest.mark.parametrize(
+    "field",
+    [Field("t_s", "ms"), Field("t_s", "", "int"), Field("tick", "s"), Field("tick", "ms", "int")],
+)
+def test_a_time_or_a_tick_in_another_unit_is_refused(tmp_path, field):
+    told = rf"stream s: {field.name} is .*, got unit '{field.unit}'; call .* otherwise"
+    with pytest.raises(PluginError, match=told):
+        make_recorder(tmp_path).open_stream(StreamSchema("s", (field,)))
+
+
+@pytest.mark.parametrize(
+    "field", [Field("t_s", "", "str"), Field("tick", "1"), Field("t_ms", "ms")]
+)
+def test_what_is_no_simulated_time_has_any_unit(tmp_path, field):
+    make_recorder(tmp_path).open_stream(StreamSchema("s", (field,)))
+
+
 def test_single_field_that_reads_as_another_kind_of_line_is_refused(tmp_path):
     schema = StreamSchema("s", (Field("end", "", "int"),), shape="object")
 

@@ -25,7 +25,7 @@ def test_commands_and_records_of_nan_break_checks_that_name_the_agent(tmp_path):
     assert broken["records.not_finite"]["worst"] == "agent-02/drive"
     assert broken["records.not_finite"]["got"] == broken["commands_refused"]["got"] > 0
     assert broken["commands_refused"]["worst"] == "agent-02"
-    assert "agent-02.error_m" in broken
+    assert broken["agent-02.error_m"]["worst"] == "agent-02"
 
     (tmp_path / "checks.yaml").write_text(
         (tmp_path / "rover.yaml").read_text()

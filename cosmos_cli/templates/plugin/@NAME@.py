@@ -120,7 +120,7 @@ class RoverHost(HostSimulation):
         limit_m = self.context.parameters.error_max_m
         worst = max(self.refused, key=lambda name: self.refused[name])
         refused = sum(self.refused.values())
-        # worst names the agent whose value it is, where one check stands for all.
+        # worst names the agent whose value it is; without it, it is the host's.
         checks = [
             Check(name="commands_refused", limit=0, got=refused, passed=refused == 0, worst=worst)
         ]
@@ -128,7 +128,7 @@ class RoverHost(HostSimulation):
             error_m = abs(position_m - self.mark_m[name])
             passed = error_m <= limit_m
             checks.append(
-                Check(name=f"{name}.error_m", limit=limit_m, got=error_m, passed=passed)
+                Check(name=f"{name}.error_m", limit=limit_m, got=error_m, passed=passed, worst=name)
             )
         return {"checks": [asdict(check) for check in checks]}
 

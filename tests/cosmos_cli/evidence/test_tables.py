@@ -163,20 +163,55 @@ def test_a_value_that_is_nested_too_deep_is_null_and_reported(tmp_path):
     found = gather(made.run, 10.0, quiet)
 
     assert pq.read_table(made.run.tables / "odd.parquet")["extra"].to_pylist() == ["[1]", None]
-    assert found.faults[0].startswith("tables/odd.parquet: 1 recorded values")
+    assert found.faults == (
+        "tables/odd.parquet: 1 values of extra (json) are null: not of their kind, first a list that cannot be shown"
+        " of agent-01",
+    )
 
 
 def test_value_that_is_not_of_its_kind_is_null_and_reported(tmp_path):
     made = SyntheticRun(tmp_path)
     schema = StreamSchema("odd", (Field("n", "", "int"), Field("x", "m")))
-    record(made, "agent-01", schema, [(1, 1.0), (2.5, "wide"), (3, True)])
+    record(made, "agent-01", schema, [(1, 1.0), (None, None)])
+    record(made, "agent-02", schema, [(1, 1.0), (2.5, "wi\x1bde"), (3, True), (None, None)])
 
     found = gather(made.run, 10.0, quiet)
 
     table = pq.read_table(made.run.tables / "odd.parquet").to_pydict()
-    assert table["n"] == [1, None, 3]
-    assert table["x"][:2] == [1.0, None]
-    assert found.faults[0].startswith("tables/odd.parquet: 3 recorded values")
+    assert table["n"] == [1, None, 1, None, 3, None]
+    assert table["x"] == [1.0, None, 1.0, None, None, None]
+    assert found.faults == (
+        "tables/odd.parquet: 1 values of n (int) are null: not of their kind, first 2.5 of agent-02;"
+        r" 2 values of x (float) are null: not of their kind, first 'wi\x1bde' of agent-02",
+    )
+
+
+@pytest.mark.parametrize("value", [3, 2.5, True, [1, 2], {"a": 1}])
+def test_what_is_no_text_is_null_where_text_belongs_and_reported(tmp_path, value):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("odd", (Field("state", "", "str"),))
+    record(made, "agent-01", schema, [("on",), (value,), (None,)])
+
+    found = gather(made.run, 10.0, quiet)
+
+    assert pq.read_table(made.run.tables / "odd.parquet")["state"].to_pylist() == ["on", None, None]
+    assert found.faults == (
+        "tables/odd.parquet: 1 values of state (str) are null: not of their kind,"
+        f" first {value!r} of agent-01",
+    )
+
+
+def test_of_many_fields_with_values_of_another_kind_the_first_are_told(tmp_path):
+    made = SyntheticRun(tmp_path)
+    schema = StreamSchema("odd", tuple(Field(name) for name in "abcde"))
+    record(made, "agent-01", schema, [("1.5",) * 5] * 7)
+
+    (fault,) = gather(made.run, 10.0, quiet).faults
+
+    assert fault.count("7 values of ") == 3
+    assert fault.endswith(
+        "of c (float) are null: not of their kind, first '1.5' of agent-01; so are those of 2 more"
+    )
 
 
 @pytest.mark.parametrize("value", [np.array([1.0]), [[1.0, 2.0]], "1.5", {"a": 1}])
@@ -190,7 +225,7 @@ def test_a_value_of_another_shape_costs_no_other_field_its_table(tmp_path, value
     table = pq.read_table(made.run.tables / "odd.parquet").to_pydict()
     assert table["n"] == [0, 1, 2, 3]
     assert table["x"] == table["m"] == [None] * 4
-    assert found.faults[0].startswith("tables/odd.parquet: 8 recorded values")
+    assert found.faults[0].startswith("tables/odd.parquet: 4 values of x (float) are null: ")
 
 
 def test_ticks_get_their_simulated_time(tmp_path):

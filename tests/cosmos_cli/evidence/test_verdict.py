@@ -257,6 +257,8 @@ def test_values_that_are_not_finite_break_a_check_of_their_own():
         {"name": "x", "limit": 1, "got": "0", "passed": True},
         {"name": "x", "limit": 1, "got": 0, "passed": "yes"},
         {"name": "x", "got": 0, "passed": True},
+        {"name": "x\x1b[31m\n", "limit": 1, "got": 0, "passed": True},
+        {"name": "x" * 201, "limit": 1, "got": 0, "passed": True},
         "x",
         None,
     ],
@@ -287,6 +289,7 @@ def test_what_is_wrong_with_a_malformed_check_is_a_remark_with_who_returned_it()
         "agent-01": {"checks": [check, {**check, "passed": True}]},
         "agent-02": {"checks": [check]},
         "agent-03": {"checks": [{**check, "passed": True, "limit": None}]},
+        "agent-04": {"checks": [{**check, "passed": True, "name": "gap\x1b\n"}, "gap\x1b"]},
     }
 
     assert malformed_check_remarks(summaries) == (
@@ -294,7 +297,16 @@ def test_what_is_wrong_with_a_malformed_check_is_a_remark_with_who_returned_it()
         " 'passed': True}",
         "agent-01, agent-02: checks of finish(): passed of 'gap_m': expected true or false, got 1",
         "agent-03: checks of finish(): limit of 'gap_m': expected a finite number, got None",
+        r"agent-04: checks of finish(): name of 'gap\x1b\n': expected a name of at most 200 printable characters, got"
+        r" 'gap\x1b\n'",
+        r"agent-04: checks of finish(): expected a list of mappings, got gap\x1b",
     )
+
+
+def test_the_worst_of_a_check_is_a_name_that_can_be_shown():
+    check = {"name": "gap_m", "limit": 1.0, "got": 0.5, "passed": True, "worst": "a\x1b[31m"}
+
+    assert plugin_checks({"host": {"checks": [check]}})[0].worst == "host"
 
 
 def test_a_halfs_check_with_the_name_of_another_is_a_remark():
