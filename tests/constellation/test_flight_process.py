@@ -307,6 +307,22 @@ def test_an_answer_without_the_end_of_its_line_is_told_with_the_wait_for_it(tmp_
         ship.give_up_once(lambda: protocol.rest).run(1)
 
 
+def test_text_where_frames_are_expected_is_told_with_the_wait_for_it(tmp_path):
+    flight = {"interface": {"protocol": "frames"}}
+    ship = Ship(tmp_path, ["sh", "-c", "echo hi; cat >&2"], flight=flight)
+    protocol = ship.agent._cockpit._software._protocol
+
+    with pytest.raises(BlamedError, match=r"it wrote 'hi\\n' which is no whole frame: text goes"):
+        ship.give_up_once(lambda: protocol.rest).run(1)
+
+
+def test_what_is_printed_where_lines_of_json_are_expected_is_told_with_where_to_print(tmp_path):
+    ship = Ship(tmp_path, program(tmp_path, "print('debug: nan', flush=True)"))
+
+    with pytest.raises(BlamedError, match=r"got 'debug: nan' \(standard output is for answers"):
+        ship.run(1)
+
+
 FOREIGN = """
 import json, socket, sys
 host, port = sys.argv[1].split(":")

@@ -396,5 +396,5 @@ class ExternalFlight:
         file = f"agents/{self._context.name}/{STDERR_TEXT}.txt"
         words = f"; its last words: {line!r} ({file})" if line else ""
         rest = getattr(self._protocol, "rest", b"")
-        cut = f"; it wrote {shown(rest)} without the end of a line" if rest else ""
+        cut = f"; it wrote {shown(rest)} {getattr(self._protocol, 'unended', '')}" if rest else ""
         return told_faults(getattr(self._protocol, "faults", {})) + cut + words

@@ -42,6 +42,9 @@ HELLO: Final = 128
 class Frames:
     """Both directions of a conversation in frames."""
 
+    unended = "which is no whole frame: text goes to standard error"
+    """What is wrong with a rest that does not go on."""
+
     def __init__(self) -> None:
         self._dialogue = Dialogue()
         self.faults = self._dialogue.faults
@@ -51,6 +54,11 @@ class Frames:
         self._buffer = bytearray()
         self._is_skipping = False
         self._t_s = 0.0
+
+    @property
+    def rest(self) -> bytes:
+        """What came and is nothing yet."""
+        return bytes(self._buffer)
 
     def setup(self, setup: SetupReport) -> list[bytes]:
         """Return the frames that tell flight software who it is."""

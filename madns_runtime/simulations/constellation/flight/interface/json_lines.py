@@ -110,6 +110,8 @@ class JsonLines:
 
     answers_by_time = False
     """One answer for each tick, in their order."""
+    unended = "without the end of a line"
+    """What is wrong with a rest that does not go on."""
 
     def __init__(self) -> None:
         self.faults: dict[str, int] = {}
@@ -156,7 +158,11 @@ def read_answer(line: bytes) -> FlightAnswer:
     try:
         answer = orjson.loads(line)
     except orjson.JSONDecodeError:
-        cure = " (JSON has no NaN and no infinity: write null)" if NO_NUMBERS.search(line) else ""
+        cure = ""
+        if not line.lstrip().startswith(b"{"):
+            cure = " (standard output is for answers alone: print to standard error)"
+        elif NO_NUMBERS.search(line):
+            cure = " (JSON has no NaN and no infinity: write null)"
         return FlightAnswer(fault=f"expected a JSON object, got {shown(line)}{cure}")
     try:
         _check(answer)
