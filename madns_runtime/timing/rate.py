@@ -333,15 +333,23 @@ def stagger(
     *,
     phase: Literal["staggered", "aligned"] = "staggered",
 ) -> float:
-    """
-    Return the phase of agent *index* of *count*, in [0, 1 / tick_hz), s.
+    """Return the phase of agent *index* of *count*, in [0, 1 / tick_hz), s; see `staggered`."""
+    return staggered(count, tick_hz, phase=phase)[index]
 
-    The phases of all agents divide the period evenly. They follow the order of the golden section's
-    multiples, so that the few agents of one machine, which are neighbours by index, are spread over
-    the period as well.
+
+def staggered(
+    count: int, tick_hz: float, *, phase: Literal["staggered", "aligned"] = "staggered"
+) -> list[float]:
     """
-    if phase == "aligned" or count <= 1:
-        return 0.0
-    position = index * GOLDEN_FRACTION % 1.0
-    rank = sum(other * GOLDEN_FRACTION % 1.0 < position for other in range(count))
-    return rank / count / tick_hz
+    Return the phases of *count* agents, each in [0, 1 / tick_hz), s.
+
+    They divide the period evenly, in the order of the golden section's multiples, so that the few agents of one
+    machine, which are neighbours by index, are spread over the period as well. Aligned agents have none.
+    """
+    if phase == "aligned":
+        return [0.0] * count
+    ranked = sorted(range(count), key=lambda index: index * GOLDEN_FRACTION % 1.0)
+    phases_s = [0.0] * count
+    for rank, index in enumerate(ranked):
+        phases_s[index] = rank / count / tick_hz
+    return phases_s
