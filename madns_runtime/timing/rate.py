@@ -15,6 +15,7 @@ from madns_runtime.errors import ConfigurationError, IllegalTransition
 
 COUNT_ROUNDING = 1e-9
 """duration times rate this close to a whole number is that number: 0.7 s at 10 Hz are 7 ticks."""
+TIME_EPSILON_S = 1e-9
 GOLDEN_FRACTION = 0.6180339887498949
 
 
@@ -39,6 +40,20 @@ def last_period_s(duration_s: float, tick_hz: float) -> float:
     or, with a phase, up to 12 s.
     """
     return max(duration_s, count_ticks(duration_s, tick_hz) / tick_hz)
+
+
+def has_tick_from(t_s: float, duration_s: float, tick_hz: float, phase_s: float = 0.0) -> bool:
+    """
+    Tell whether a run still has a tick for an agent that returns to it.
+
+    Args:
+        t_s: Simulated time of its return, s.
+        duration_s: Of the run, s.
+        tick_hz: Its rate, Hz.
+        phase_s: Offset of its deadlines, s; in lockstep no agent has one.
+    """
+    last_s = (count_ticks(duration_s, tick_hz) - 1) / tick_hz + phase_s
+    return t_s <= last_s + TIME_EPSILON_S
 
 
 class TickTiming(NamedTuple):
