@@ -100,22 +100,6 @@ class Link:
             limits=limits,
         )
 
-    @classmethod
-    def for_host(
-        cls,
-        run_key: bytes,
-        session: bytes,
-        agent_index: int,
-        incarnation_id: int,
-        *,
-        limits: LinkLimits = LinkLimits(),  # noqa: B008 - frozen
-    ) -> Link:
-        """Return the host's end of a conversation; see `datagram.derive_keys` for the arguments."""
-        return cls(
-            seal=Seal.derive(run_key, session, agent_index, incarnation_id, Role.HOST),
-            limits=limits,
-        )
-
     # What the owner asks.
 
     @property
