@@ -16,13 +16,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cosmos_cli.evidence.arrow_values import ARROW_TYPES
-from cosmos_cli.evidence.streams import DETAILS, NUMBER_KINDS, RecordFile
+from cosmos_cli.evidence.streams import DETAILS, RecordFile
 from cosmos_cli.evidence.table_labels import TableLabels
 from madns_runtime.analysis.tables import AGENT, INCARNATION
 from madns_runtime.conditions.condition import TIME
 from madns_runtime.plain_values import is_real
 from madns_runtime.recording.columns import column_of
-from madns_runtime.recording.records import Field
+from madns_runtime.recording.records import NUMBER_KINDS, Field
 from madns_runtime.units import conversion, converted
 
 SIMULATED_UTC = "simulated_utc"

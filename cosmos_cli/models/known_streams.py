@@ -24,6 +24,7 @@ from madns_runtime.recording.records import (
     LATE_TICKS,
     LOG,
     LOG_LEVELS,
+    NUMBER_KINDS,
     PROCESS,
     TICKS,
     Field,
@@ -33,7 +34,6 @@ from madns_runtime.units import conversion
 REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS, HEALTH))
 """Framework streams that no run in lockstep records: no time passes there that could be late."""
 NOT_A_VALUE = ("json", "packed")
-NUMBER_KINDS = ("float", "int")
 OF_DEVICES_OWN = (DEVICE_STATE, DEVICE_CLOCK, EVENTS, LOG)
 """Streams of a device beside its channels: how it fares, not what it measures."""
 INPUT_HEAD = tuple(field.name for field in schema_of(Channel(name="any")).fields[:-1])

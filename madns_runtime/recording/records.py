@@ -33,6 +33,8 @@ class Field:
 
 FIELD_KINDS = ("float", "int", "str", "bool", "json", "packed")
 """All kinds of fields."""
+NUMBER_KINDS = ("float", "int")
+"""Kinds of numbers."""
 
 
 @dataclass(frozen=True, slots=True)

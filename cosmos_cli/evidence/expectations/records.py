@@ -11,10 +11,9 @@ import orjson
 from numpy.typing import NDArray
 
 from cosmos_cli.evidence.expectations.accumulators import Flags, Floats, Places, as_numbers
-from cosmos_cli.evidence.streams import NUMBER_KINDS
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST, TIME
-from madns_runtime.recording.records import HEALTH, Field
+from madns_runtime.recording.records import HEALTH, NUMBER_KINDS, Field
 from madns_runtime.recording.stream_rules import DETAILS
 
 BATCH_RECORDS = 65_536
