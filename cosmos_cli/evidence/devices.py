@@ -287,7 +287,7 @@ def _stimulus(told: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
         for channel, counts in mapping_at(each, "stimulus").items():
             zeros: dict[str, Any] = {**dict.fromkeys(POINT_COUNTS, 0), "underruns": 0}
             joined = found.setdefault(clean_line(str(channel)), zeros)
-            for name in zeros.keys() - {"lateness_us"}:
+            for name in zeros:
                 joined[name] = int(_added(joined[name], mapping_at(counts).get(name)))
             lateness = joined.setdefault("lateness_us", {})
             for name in ("p50", "p99", "max"):
