@@ -362,10 +362,9 @@ def _held_fault(expectation: Expectation, held: HeldBounds, source: RecordSource
         return f"stream {stream} has no field {field_}"
     if not source.has_time(stream):
         return f"records of stream {stream} tell no time"
-    owners = {owner_of(name) for name in expectation.agents}
-    for name in source.sources_apart(stream) or (NOBODY,):
-        if owners and owner_of(name) not in owners:
-            continue
+    owners, apart = {owner_of(name) for name in expectation.agents}, source.sources_apart(stream)
+    held_by = [name for name in apart if not owners or owner_of(name) in owners]
+    for name in held_by if apart else (NOBODY,):
         recorded = source.unit_of(stream, field_, name)
         if held.unit and conversion(held.unit, recorded) is None:
             return f"{stream}.{field_} is in {recorded or '1'}"
