@@ -369,6 +369,8 @@ class Launch:
     """Time for an operator on another computer to come back when its line has ended, s; 0: that is its end."""
     devices: tuple[DeviceLaunch, ...] = ()
     """Devices that are driven: of agents those of their machine; of the host, in lockstep, those of all agents."""
+    phases_s: Mapping[str, float] = field(default_factory=dict)
+    """Offset of an agent's deadlines within the period, s, in real time: of agents of this machine; of the host of all. Without, 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -384,8 +386,6 @@ class AgentLaunch(Launch):
     """Name of this machine in the inventory."""
     agents: tuple[str, ...]
     """Names of the agents to run here."""
-    packs_elsewhere: tuple[int, int] | None = None
-    """Packs of agents on machines before this one and behind it, where several agents share a process; None: all agents are here."""
     host_address: str
     host_port: int
     life: Annotated[int, Ge(1)] = 1

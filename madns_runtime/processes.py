@@ -28,6 +28,8 @@ from typing import Literal, Self
 Role = Literal["operator", "host", "supervisor", "agent"]
 
 FILE_BYTES_MAX = 16_384
+ENVIRONMENT_BYTES_MAX = 8 * 1024**2
+"""No kernel takes a larger one, as the stack is limited by default."""
 NAME_CHARACTERS_MAX = 200
 """Characters entered of the name of a process of many agents, which lists them all."""
 NOT_THERE = (FileNotFoundError, ProcessLookupError, PermissionError)
@@ -193,6 +195,17 @@ def end_process(entry: ProcessEntry, number: int = signal.SIGTERM) -> bool:
     finally:
         os.close(descriptor)
     return True
+
+
+def read_environment(pid: int) -> list[bytes]:
+    """
+    Return the variables of a process's environment, NAME=VALUE each.
+
+    Raises:
+        OSError: It is another user's, or has ended.
+    """
+    with open(f"/proc/{pid}/environ", "rb") as file:
+        return file.read(ENVIRONMENT_BYTES_MAX).split(b"\0")
 
 
 def read_start_ticks(pid: int) -> int | None:

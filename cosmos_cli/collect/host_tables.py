@@ -335,6 +335,7 @@ def layout_with(labels: TableLabels) -> Layout:
         fields=(TIME, *fields),
         tick_hz=None,
         labels=labels,
+        units={},
     )
 
 

@@ -24,9 +24,9 @@ from cosmos_cli.collect.disk import hash_of, local_disk
 from cosmos_cli.collect.machine_sources import MACHINES, RecordingMachine, RecordingMachines
 from cosmos_cli.collect.remote_manifest import MANIFEST_NAME, RETRIEVED_NAME, shown
 from cosmos_cli.errors import InputError
-from cosmos_cli.evidence.completeness import COUNT_MAX
 from cosmos_cli.evidence.run_directory import SCHEMA, RunDirectory, utc_now, write_json
 from cosmos_cli.evidence.run_documents import Problem
+from madns_runtime.recording.records import WHOLE_MAX
 
 EVERY, NONE = "all", "none"
 """Words beside the names of machines: all that were not released yet; those that were forgotten are asked again."""
@@ -121,7 +121,7 @@ def _kept(entry: Mapping[str, Any]) -> dict[str, Any]:
     kept: dict[str, Any] = {}
     for name in ("bytes", "mtime_s"):
         number = entry.get(name)
-        if isinstance(number, int) and not isinstance(number, bool) and abs(number) <= COUNT_MAX:
+        if isinstance(number, int) and not isinstance(number, bool) and abs(number) <= WHOLE_MAX:
             kept[name] = number
     if "kind" not in entry:
         return {**kept, "sha256": entry["sha256"]}

@@ -37,7 +37,7 @@ from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.device_sampling import missing_for
 from cosmos_cli.launch.plan import make_plan
-from cosmos_cli.launch.plan_view import feasibility_of, resources_of
+from cosmos_cli.launch.plan_view import LATENCY_MS_UNKNOWN, feasibility_of, resources_of
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.devices import driven_devices
 from cosmos_cli.models.inventory.machine import LOOPBACK
@@ -60,7 +60,6 @@ COLUMNS = (
 OF_MACHINES = re.compile(r"^(`cosmos (?:up|reboot|wipe))(?: -i INVENTORY)?(?=[ `])")
 """A command that is the cure itself, and wants an inventory; one behind a line of the inventory names none."""
 HERE_ADDRESS = "127.0.0.1"
-LATENCY_S_UNKNOWN = 0.5e-3
 
 Told = dict[str, Any]
 
@@ -232,7 +231,7 @@ class _Examination:
             and trip.get("p50_ms") is not None
         ]
         given_ms = self._scenario_file.scenario.plan.latency_ms
-        unknown_s = LATENCY_S_UNKNOWN if given_ms is None else given_ms / 1e3
+        unknown_s = (LATENCY_MS_UNKNOWN if given_ms is None else given_ms) / 1e3
         latency_s = max(trips_ms) / 2e3 if trips_ms else unknown_s
         resources = resources_of(self._scenario_file, latency_s)
         found = feasibility_of(self._scenario_file, resources)

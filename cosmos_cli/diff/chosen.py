@@ -15,6 +15,7 @@ from cosmos_cli.diff.side import Side
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.models.agent_labels import AgentLabels
+from cosmos_cli.models.declared_streams import every_stream
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY
 from cosmos_cli.models.loading import ScenarioFile
@@ -66,7 +67,7 @@ def _names_of(scenario: ScenarioFile) -> Iterator[str]:
     for name in FRAMEWORK_STREAMS:
         if not (is_lockstep and name in REAL_TIME_ONLY):
             yield from (name, f"host_{name}", f"machine_{name}")
-    for stream in scenario.streams or ():
+    for stream in every_stream(scenario.streams or (), scenario.agent_streams):
         yield stream.name
         if stream.role == "host":
             yield f"host_{stream.name}"

@@ -11,12 +11,11 @@ import numpy as np
 
 from cosmos_cli.diff.fields import FieldDifference, RecordPlace, place_of, subject_of
 from cosmos_cli.diff.recorded import ROWS_READ_MAX, Recorded
-from cosmos_cli.evidence.streams import NUMBER_KINDS
 from madns_runtime.analysis.matching import KeyWentBackError, Matched, Orders, Rows, joined, match
 from madns_runtime.analysis.record_order import RecordOrder, learn_order
 from madns_runtime.analysis.sampling import as_array
 from madns_runtime.analysis.values import Floats
-from madns_runtime.recording.records import Field
+from madns_runtime.recording.records import NUMBER_KINDS, Field
 
 TICK_TOLERANCE = 0.25
 """Ticks are whole numbers."""

@@ -24,8 +24,6 @@ FAULTS_SHOWN_MAX = 3
 HOST = "host"
 LOCKSTEP = "lockstep"
 """The time mode, in run.json."""
-COUNT_MAX = 2**53
-"""Largest count of a file: JSON's readers agree on whole numbers up to here."""
 NOTHING: Mapping[str, str] = MappingProxyType({})
 NO_FILES: Mapping[str, Sequence[str]] = MappingProxyType({})
 

@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from cosmos_cli.evidence.completeness import COUNT_MAX, NOTHING
+from cosmos_cli.evidence.completeness import NOTHING
 from madns_runtime.plain_values import mapping_at
+from madns_runtime.recording.records import WHOLE_MAX
 
 SERVICES = ("best", "reliable", "sync")
 OWN_NAMES = ("lost", "duplicated", "out_of_order")
@@ -120,7 +121,7 @@ def _host_ends(messages: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def whole_count(value: object) -> int:
     """Return a count from a file; 0 for what is none."""
-    if isinstance(value, int) and not isinstance(value, bool) and abs(value) <= COUNT_MAX:
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) <= WHOLE_MAX:
         return value
     return 0
 

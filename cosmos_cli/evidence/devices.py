@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from cosmos_cli.evidence.completeness import COUNT_MAX
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.run_documents import read_object
 from cosmos_cli.evidence.verdict import CheckResult, at_most, is_number
@@ -17,7 +16,7 @@ from cosmos_cli.ui.plural import counted
 from madns_runtime.config import HardwareSettings
 from madns_runtime.hardware.profiles import POINT_COUNTS
 from madns_runtime.plain_values import mapping_at
-from madns_runtime.recording.records import DEVICE_LOSSES
+from madns_runtime.recording.records import DEVICE_LOSSES, WHOLE_MAX
 
 ACCOUNT_NAME = re.compile(r"devices(?:\.([1-9][0-9]{0,8}))?\.json")
 """Accounts of a machine's devices, below machines/<machine>/: one per incarnation of its supervisor."""
@@ -288,7 +287,7 @@ def _stimulus(told: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
         for channel, counts in mapping_at(each, "stimulus").items():
             zeros: dict[str, Any] = {**dict.fromkeys(POINT_COUNTS, 0), "underruns": 0}
             joined = found.setdefault(clean_line(str(channel)), zeros)
-            for name in zeros.keys() - {"lateness_us"}:
+            for name in zeros:
                 joined[name] = int(_added(joined[name], mapping_at(counts).get(name)))
             lateness = joined.setdefault("lateness_us", {})
             for name in ("p50", "p99", "max"):
@@ -311,7 +310,7 @@ def _sum(told: Iterable[Mapping[str, Any]], key: str) -> int | None:
     values = [each.get(key) for each in told]
     numbers = [int(value) for value in values if _is_count(value)]
     total = sum(numbers)
-    return total if len(numbers) == len(values) and abs(total) <= COUNT_MAX else None
+    return total if len(numbers) == len(values) and abs(total) <= WHOLE_MAX else None
 
 
 def _frozen(told: Iterable[Mapping[str, Any]]) -> int | None:
@@ -325,7 +324,7 @@ def _frozen(told: Iterable[Mapping[str, Any]]) -> int | None:
         if not all(map(_is_count, numbers)):
             return None
         total += sum(map(int, numbers))
-    return total if abs(total) <= COUNT_MAX else None
+    return total if abs(total) <= WHOLE_MAX else None
 
 
 def _counts(told: Iterable[Mapping[str, Any]]) -> dict[str, float]:
@@ -346,4 +345,4 @@ def _added(total: float, value: object) -> float:
 
 def _is_count(value: object) -> TypeGuard[float]:
     """Tell whether a value from a file is a number that run.json can hold, and so can a sum of some."""
-    return is_number(value) and abs(value) <= COUNT_MAX
+    return is_number(value) and abs(value) <= WHOLE_MAX

@@ -9,7 +9,7 @@ from typing import Any
 
 import orjson
 
-from cosmos_cli.evidence.completeness import COUNT_MAX, ExpectedRecords, is_excused, is_in_lockstep
+from cosmos_cli.evidence.completeness import ExpectedRecords, is_excused, is_in_lockstep
 from cosmos_cli.evidence.datagrams import (
     SERVICES,
     datagram_account,
@@ -42,6 +42,7 @@ from cosmos_cli.models.inventory.machine import LOOPBACK
 from madns_runtime.config import HardwareSettings, RunConfig
 from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.newest_values import clean_values
+from madns_runtime.recording.records import WHOLE_MAX
 from madns_runtime.timing.rate import count_ticks
 
 
@@ -396,4 +397,4 @@ def _count(messages: Mapping[str, Any], service: str, name: str) -> int | None:
     """Return a count; None if the class was not reported at all, 0 if it never counted anything."""
     counts = messages.get(service)
     value = counts.get(name, 0) if isinstance(counts, Mapping) else None
-    return int(value) if is_number(value) and abs(value) <= COUNT_MAX else None
+    return int(value) if is_number(value) and abs(value) <= WHOLE_MAX else None

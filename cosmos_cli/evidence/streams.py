@@ -23,14 +23,19 @@ from numpy.typing import NDArray
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.errors import MachineError
 from madns_runtime.recording.reader import StreamReading, read_stream
-from madns_runtime.recording.records import FRAMEWORK_SCHEMAS, SCHEMA_VERSION, Field, StreamSchema
+from madns_runtime.recording.records import (
+    FRAMEWORK_SCHEMAS,
+    NUMBER_KINDS,
+    SCHEMA_VERSION,
+    Field,
+    StreamSchema,
+)
 from madns_runtime.recording.stream_rules import DETAILS as DETAILS_NAME
 
 SUFFIX = ".jsonl"
 INCARNATION = re.compile(r"[1-9][0-9]{0,4}")
 """In a file's name; what bears another number, to which no recorder counts, is a stream of that name."""
 INCARNATION_MAX = 99_999
-NUMBER_KINDS = ("float", "int")
 DETAILS = Field(DETAILS_NAME, "", "json")
 """Column of what events carry beside their fields."""
 Role = Literal["host", "agent", "machine", "device"]

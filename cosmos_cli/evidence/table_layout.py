@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,17 +16,19 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cosmos_cli.evidence.arrow_values import ARROW_TYPES
-from cosmos_cli.evidence.streams import DETAILS, NUMBER_KINDS, RecordFile
+from cosmos_cli.evidence.streams import DETAILS, RecordFile
 from cosmos_cli.evidence.table_labels import TableLabels
 from madns_runtime.analysis.tables import AGENT, INCARNATION
 from madns_runtime.conditions.condition import TIME
 from madns_runtime.plain_values import is_real
 from madns_runtime.recording.columns import column_of
-from madns_runtime.recording.records import Field
+from madns_runtime.recording.records import NUMBER_KINDS, Field
 from madns_runtime.units import conversion, converted
 
 SIMULATED_UTC = "simulated_utc"
 METADATA_KEY = b"cosmos"
+UNITS_KEY = b"units"
+"""Metadata of a column that has no unit of its own: those of its sources."""
 NO_LABELS = TableLabels()
 DEVICE = "device"
 """Role of devices: those of one name are no copies of each other, as agents are."""
@@ -44,6 +46,8 @@ class TableLayout:
     """Rate from which t_s is made of the field tick; None where there is nothing to make."""
     labels: TableLabels = NO_LABELS
     """Columns that are added to each record."""
+    units: Mapping[str, Mapping[str, str]]
+    """Units by source of numbers whose column has none, by field: of devices that measure different things."""
 
     @property
     def _names(self) -> set[str]:
@@ -76,7 +80,9 @@ class TableLayout:
         if self.label:
             columns.append(pa.field(self.label, pa.dictionary(pa.int32(), pa.string())))
         for field in self.fields:
-            about = {"unit": field.unit, "kind": field.kind}
+            about: dict[str | bytes, str] = {"unit": field.unit, "kind": field.kind}
+            if field.name in self.units:
+                about[UNITS_KEY] = json.dumps(self.units[field.name])
             columns.append(pa.field(field.name, ARROW_TYPES[field.kind], metadata=about))
         note = {
             "table": self.name,
@@ -119,7 +125,21 @@ def plan_table(
         fields=tuple(f for f in merged.values() if f.name != INCARNATION and f.kind != "packed"),
         tick_hz=tick_hz if needs_time else None,
         labels=labels,
+        units=_units_apart(files, merged) if role == DEVICE else {},
     )
+
+
+def _units_apart(
+    files: Sequence[RecordFile], merged: Mapping[str, Field]
+) -> dict[str, dict[str, str]]:
+    """Return the units by source of numbers whose column has none, by field."""
+    units: dict[str, dict[str, str]] = {}
+    for file in files:
+        for own in file.fields:
+            column = merged[own.name]
+            if own.unit and not column.unit and column.kind in NUMBER_KINDS:
+                units.setdefault(own.name, {})[file.source] = own.unit
+    return units
 
 
 def in_unit(values: NDArray[Any], unit: str, column: Field, role: str) -> tuple[NDArray[Any], int]:

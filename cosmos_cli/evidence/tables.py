@@ -35,7 +35,7 @@ from cosmos_cli.evidence.arrow_values import (
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import Columns, RecordFile
 from cosmos_cli.evidence.table_labels import NEVER_US
-from cosmos_cli.evidence.table_layout import METADATA_KEY, TableLayout, in_unit
+from cosmos_cli.evidence.table_layout import METADATA_KEY, UNITS_KEY, TableLayout, in_unit
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.analysis.tables import AGENT, INCARNATION, RecordedRun
 from madns_runtime.conditions.condition import TIME
@@ -178,7 +178,8 @@ class TableReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = pq.ParquetFile(path, page_checksum_verification=True)
-        note = json.loads((self._file.schema_arrow.metadata or {})[METADATA_KEY])
+        self._schema = self._file.schema_arrow
+        note = json.loads((self._schema.metadata or {})[METADATA_KEY])
         self.name: str = note["table"]
         self.role: str = note["role"]
         self._source_column: str = note["source_column"]
@@ -202,23 +203,29 @@ class TableReader:
     @property
     def fields(self) -> tuple[Field, ...]:
         """The recorded fields, t_s first if it was made."""
-        schema = self._file.schema_arrow
+        schema = self._schema
         skipped = (self._source_column, INCARNATION, *self._labels)
         return tuple(_field(schema.field(name)) for name in schema.names if name not in skipped)
+
+    def unit(self, source: str, name: str) -> str:
+        """Return the unit of a source's values of a field: its own one, where the column has none."""
+        about = self._schema.field(name).metadata or {}
+        own = about.get(UNITS_KEY)
+        return str(json.loads(own).get(source, "")) if own else about.get(b"unit", b"").decode()
 
     @property
     def recorded_fields(self) -> tuple[Field, ...]:
         """The fields without a t_s that was made of the tick, as the stream's own schema has them."""
         made = [
             column.name
-            for column in self._file.schema_arrow
+            for column in self._schema
             if column.name == TIME and b"kind" not in (column.metadata or {})
         ]
         return tuple(field for field in self.fields if field.name not in made)
 
     def has(self, *names: str) -> bool:
         """Tell whether the table has all these columns."""
-        return set(names) <= set(self._file.schema_arrow.names)
+        return set(names) <= set(self._schema.names)
 
     def read(self, source: str, names: Iterable[str]) -> Columns:
         """

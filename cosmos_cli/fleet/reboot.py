@@ -145,7 +145,7 @@ def same_words(name: str) -> str:
     return f"it is {name}, under another name"
 
 
-def refuse_if_living(living: Sequence[Mapping[str, Any]], others: Sequence[str] = ()) -> None:
+def refuse_if_living(living: Sequence[Mapping[str, Any]], others: Sequence[str]) -> None:
     """
     Let nobody take a machine away from a run, be it of another user or another folder there.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 from cosmos_cli.fleet.target import target_of
 from cosmos_cli.launch.capacity import Capacity, ComputerFacts
@@ -12,28 +11,12 @@ from cosmos_cli.models.inventory import Machine
 from cosmos_cli.ui.console import Column, Console
 from madns_runtime.lockstep.partition import processors_here
 
+HERE: tuple[str, int | None] = ("", None)
+"""Address and port, by which computers are told apart without asking them, of the operator's own."""
 BOARD_PROCESSORS = 4
 """Processors of a machine that nobody has asked yet: those of a Raspberry Pi since its second model."""
 HERE_NAME = "this computer"
 LIMITS = (Column("limit"), Column("agents at most", is_number=True), Column("why"))
-
-
-class _Place(NamedTuple):
-    """Key that tells one computer from another without asking it."""
-
-    address: str
-    port: int | None
-
-    @classmethod
-    def of(cls, machine: Machine | None) -> _Place:
-        """Return where a machine is; None is the operator's own."""
-        if machine is None or machine.connection == "local":
-            return HERE
-        target = target_of(machine)
-        return cls(target.address, target.port)
-
-
-HERE = _Place("", None)
 
 
 def computers_of(plan: LaunchPlan) -> list[ComputerFacts]:
@@ -44,12 +27,12 @@ def computers_of(plan: LaunchPlan) -> list[ComputerFacts]:
     Raspberry Pi, and with speed 1.
     """
     with_agents = [*(planned.machine for planned in plan.machines), *plan.spare]
-    host = _Place.of(plan.host)
-    names: dict[_Place, str] = {}
+    host = _place_of(plan.host)
+    names: dict[tuple[str, int | None], str] = {}
     for machine in (*with_agents, plan.host):
-        place = _Place.of(machine)
+        place = _place_of(machine)
         names.setdefault(place, HERE_NAME if machine is None or place == HERE else machine.name)
-    are_used = {_Place.of(machine) for machine in with_agents}
+    are_used = {_place_of(machine) for machine in with_agents}
     return [
         ComputerFacts(
             name=name,
@@ -59,6 +42,13 @@ def computers_of(plan: LaunchPlan) -> list[ComputerFacts]:
         )
         for place, name in names.items()
     ]
+
+
+def _place_of(machine: Machine | None) -> tuple[str, int | None]:
+    if machine is None or machine.connection == "local":
+        return HERE
+    target = target_of(machine)
+    return target.address, target.port
 
 
 def show_capacity(console: Console, capacity: Capacity) -> None:

@@ -16,7 +16,8 @@ import orjson
 from cosmos_cli.evidence.run_documents import LEVELS_MAX
 from cosmos_cli.ui.foreign_text import clean_line
 from madns_runtime.plain_values import is_nested_deeper, mapping_at
-from madns_runtime.recording.newest_values import WHOLE_MAX, Value, clean_values
+from madns_runtime.recording.newest_values import Value, clean_values
+from madns_runtime.recording.records import WHOLE_MAX
 
 NOISE_CHARACTERS_MAX = 500
 """Characters shown of a line that is no event."""

@@ -17,7 +17,7 @@ import orjson
 from cosmos_cli.fleet.connection import Stream
 from cosmos_cli.fleet.failure import MachineFailure
 from cosmos_cli.launch.channel import StreamChannel
-from madns_runtime.recording.newest_values import WHOLE_MAX
+from madns_runtime.recording.records import WHOLE_MAX
 
 COMMANDS_KEPT_MAX = 10_000
 """Commands of a run that could be sent again; a run of thousands of agents has fewer."""

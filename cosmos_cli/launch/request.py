@@ -16,6 +16,7 @@ from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from madns_runtime.config import AgentLaunch, DeviceLaunch, HostLaunch, RunConfig, to_mapping
 from madns_runtime.plugin.registry import is_file
 from madns_runtime.timing.pack_split import packs_on_machine
+from madns_runtime.timing.rate import staggered
 
 MANUAL_READY_S = 600.0
 """Time to start an agent by hand."""
@@ -138,6 +139,7 @@ class LaunchRequest:
             devices=tuple(itertools.chain(*self.devices.values()))
             if is_lockstep or self.is_detached
             else (),
+            phases_s={} if is_lockstep else self.phases_s(),
         )
         return to_mapping(launch)
 
@@ -162,14 +164,14 @@ class LaunchRequest:
             listening: Where the host listens.
             start: Which of that machine's supervisors it is.
         """
-        place = self.place_of(machine)
+        place, phases_s = self.place_of(machine), self.phases_s()
         launch = AgentLaunch(
             config=config_at(self.config, place),
             run_key_hex=self.run_key_hex,
             session_hex=self.session_hex,
             machine=machine,
             agents=agents,
-            packs_elsewhere=self.packs_elsewhere(machine),
+            phases_s={name: phases_s[name] for name in agents if name in phases_s},
             host_address=place.host_address or listening.address,
             host_port=listening.port,
             directory=place.directory,
@@ -182,14 +184,16 @@ class LaunchRequest:
         )
         return to_mapping(launch)
 
-    def packs_elsewhere(self, machine: str) -> tuple[int, int] | None:
-        """Return how many packs tick on the machines before one and behind it; None where all agents are on one, or by themselves."""
-        per_process, names = self.config.agents.per_process, tuple(self.machines)
-        if per_process == 1 or machine not in names or len(names) == 1:
-            return None
-        packs = [len(packs_on_machine(agents, per_process)) for agents in self.machines.values()]
-        place = names.index(machine)
-        return sum(packs[:place]), sum(packs[place + 1 :])
+    def phases_s(self) -> dict[str, float]:
+        """Return the phase of each agent, s: the run's packs divide the period, machine by machine, whoever is gone by then."""
+        agents = self.config.agents
+        is_apart = agents.per_process > 1 and len(self.machines) > 1
+        groups = tuple(self.machines.values()) if is_apart else (agents.resolved_names(),)
+        packs = [pack for names in groups for pack in packs_on_machine(names, agents.per_process)]
+        phases_s = staggered(len(packs), agents.tick_hz, phase=agents.phase)
+        return {
+            name: phase_s for pack, phase_s in zip(packs, phases_s, strict=True) for name in pack
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -174,3 +174,33 @@ class CheckRule(BoundsRule):
 
 def _listed(words: tuple[str, ...]) -> str:
     return f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def expected_words(rule: CheckRule, stream: str, field: str, unit: str) -> str:
+    """Return what a rule expects of a stream and a field, as a person reads it; *unit* is the field's own."""
+    when = _times(rule)
+    if rule.event is not None:
+        must = "must not occur" if rule.must == "not_occur" else "must occur"
+        by = f" by {rule.before_s:g} s" if rule.before_s is not None else ""
+        within = f" within {rule.within_s:g} s" if rule.within_s is not None else ""
+        after = f"{within} after {rule.after}" if rule.after else ""
+        return f"{rule.event} in {stream} {must}{by}{after}{when}"
+    what = f"{stream}.{field}" if field else stream
+    own = rule.unit or unit
+    if rule.kind in OF_TIMES:
+        assert rule.when is not None
+        return f"{rule.kind} of {what} {rule.when.words(own)}: {rule.words('s')}{when}"
+    if rule.kind in OF_NUMBERS:
+        counted = "" if rule.when is None else f" {rule.when.words(own)}"
+        return f"{rule.kind} of {what}{counted}: {rule.words('1/s' if rule.kind == 'rate' else '')}{when}"
+    statistic = "last" if rule.at_end else rule.kind
+    return f"{statistic} of {what} {rule.words(own)}{when}"
+
+
+def _times(rule: CheckRule) -> str:
+    text = "" if rule.from_s is None else f" from {rule.from_s:g} s"
+    text += "" if rule.to_s is None else f" to {rule.to_s:g} s"
+    if rule.while_ is None:
+        return text
+    held = rule.while_
+    return f"{text} while {held.stream}.{held.field} {held.words(held.unit)}"

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from cosmos_cli.models.agent_labels import AgentLabels
-from cosmos_cli.models.check_rules import OF_NUMBERS, OF_TIMES, CheckRule
+from cosmos_cli.models.check_rules import OF_NUMBERS, OF_TIMES, CheckRule, expected_words
 from cosmos_cli.models.device_uses import named_agents
 from cosmos_cli.models.document import did_you_mean
 from cosmos_cli.models.expectation import Expectation, HeldBounds, owner_of
@@ -146,11 +146,16 @@ class _Placing:
         self._rule, self._around = rule, around
         self._stream = rule.stream or EVENTS.name
         self._field = rule.field or (EVENT_FIELD if rule.event is not None else "")
+        self._streams = around.streams
+        if rule.agents:
+            self._streams = around.streams.used_by(
+                around.labels.like_any(rule.agents, around.agents)
+            )
         self._roles = around.streams.roles(self._stream)
         self._is_apart = around.streams.is_apart(self._stream)
 
     def faults(self) -> Iterator[RuleFault]:
-        rule, streams = self._rule, self._around.streams
+        rule, streams = self._rule, self._streams
         yield from self._time_faults()
         if fault := streams.stream_fault(self._stream):
             yield ("stream",), fault
@@ -246,7 +251,7 @@ class _Placing:
 
     def _value_faults(self, field: Field | None) -> Iterator[RuleFault]:
         rule = self._rule
-        streams, stream = self._around.streams, self._stream
+        streams, stream = self._streams, self._stream
         if rule.event is not None:
             if field is not None and field.kind != "str":
                 yield ("field",), f"{field.name} holds no words: an event is a word of a text field"
@@ -261,6 +266,8 @@ class _Placing:
         if bounded is not None:
             yield from words_at(below, kind_faults(bounded, field))
             yield from words_at(below, range_faults(bounded, rule.unit, field))
+            if fault := streams.kinds_fault(stream, self._field):
+                yield ("field",), fault
             if fault := streams.word_fault(stream, self._field, bounded.equals, rule.agents):
                 yield (*below, "equals"), fault
         if not is_statistic and isinstance(rule.equals, str) and rule.kind not in ("each", "last"):
@@ -272,7 +279,7 @@ class _Placing:
         yield from unit_faults(rule.unit, field, must_know=rule.stop_when_broken)
 
     def _while_faults(self, rule: FieldRule) -> Iterator[RuleFault]:
-        streams = self._around.streams
+        streams = self._streams
         stream, name = rule.stream, rule.field
         if fault := streams.stream_fault(stream):
             yield ("stream",), fault
@@ -283,6 +290,8 @@ class _Placing:
             yield ("stream",), text
         elif fault := self._unlike_fault(stream):
             yield ("stream",), fault
+        elif fault := streams.kinds_fault(stream, name):
+            yield ("field",), fault
         else:
             field = streams.field(stream, name)
             yield from kind_faults(rule, field)
@@ -314,19 +323,19 @@ class _Placing:
             and around.streams.names_agents(self._stream)
             and HOST not in rule.agents
         )
-        field = around.streams.field(self._stream, self._field)
+        field = self._streams.field(self._stream, self._field)
         of = "" if field is None else field.unit
         held = rule.while_
         return Expectation(
             name=rule.name,
-            words=_words(rule, self._stream, self._field, of),
+            words=expected_words(rule, self._stream, self._field, of),
             stream=self._stream,
             field=self._field,
             agents=self._agents(is_of_host=is_of_host),
             is_of_host=is_of_host,
             statistic=rule.kind,
             bounds=ValueBounds() if rule.event is not None else rule.bounds(),
-            unit=around.streams.bounds_unit(self._stream, self._field, rule.unit),
+            unit=self._streams.bounds_unit(self._stream, self._field, rule.unit),
             when=None if rule.when is None else rule.when.bounds(),
             from_s=rule.from_s,
             to_s=_earliest(rule.to_s, rule.before_s),
@@ -336,10 +345,10 @@ class _Placing:
                 stream=held.stream,
                 field=held.field,
                 bounds=held.bounds(),
-                unit=around.streams.bounds_unit(held.stream, held.field, held.unit),
+                unit=self._streams.bounds_unit(held.stream, held.field, held.unit),
             ),
             event=rule.event or "",
-            has_known_words=bool(around.streams.words(self._stream, self._field)),
+            has_known_words=bool(self._streams.words(self._stream, self._field)),
             must=rule.must or "occur",
             after=rule.after or "",
             within_s=rule.within_s,
@@ -365,33 +374,3 @@ class _Placing:
 
 def _earliest(*times_s: float | None) -> float | None:
     return min((each for each in times_s if each is not None), default=None)
-
-
-def _words(rule: CheckRule, stream: str, field: str, unit: str) -> str:
-    """Return what a rule expects, as a person reads it."""
-    when = _times(rule)
-    if rule.event is not None:
-        must = "must not occur" if rule.must == "not_occur" else "must occur"
-        by = f" by {rule.before_s:g} s" if rule.before_s is not None else ""
-        within = f" within {rule.within_s:g} s" if rule.within_s is not None else ""
-        after = f"{within} after {rule.after}" if rule.after else ""
-        return f"{rule.event} in {stream} {must}{by}{after}{when}"
-    what = f"{stream}.{field}" if field else stream
-    own = rule.unit or unit
-    if rule.kind in OF_TIMES:
-        assert rule.when is not None
-        return f"{rule.kind} of {what} {rule.when.words(own)}: {rule.words('s')}{when}"
-    if rule.kind in OF_NUMBERS:
-        counted = "" if rule.when is None else f" {rule.when.words(own)}"
-        return f"{rule.kind} of {what}{counted}: {rule.words('1/s' if rule.kind == 'rate' else '')}{when}"
-    statistic = "last" if rule.at_end else rule.kind
-    return f"{statistic} of {what} {rule.words(own)}{when}"
-
-
-def _times(rule: CheckRule) -> str:
-    text = "" if rule.from_s is None else f" from {rule.from_s:g} s"
-    text += "" if rule.to_s is None else f" to {rule.to_s:g} s"
-    if rule.while_ is None:
-        return text
-    held = rule.while_
-    return f"{text} while {held.stream}.{held.field} {held.words(held.unit)}"

@@ -21,12 +21,13 @@ class DeclaredStreams:
     """The whole declaration of a simulation."""
 
     of_all: tuple[DeclaredStream, ...]
+    """By the scenario's parameters: of the host's half, and of agents without parameters of their own."""
     of_agents: tuple[AgentStreams, ...] = ()
 
     def stream_of(self, role: str, name: str, source: str) -> DeclaredStream | None:
         """Return the declaration of a stream that *source* records; None if there is none."""
         ruled = (each.streams for each in self.of_agents if source in each.agents)
-        streams = next(ruled, self.of_all) if role == "agent" else self.of_all
+        streams = next(ruled, self.of_all) if role == "agent" else self.every()
         return next((one for one in streams if (one.role, one.name) == (role, name)), None)
 
     def every(self) -> tuple[DeclaredStream, ...]:

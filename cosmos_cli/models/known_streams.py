@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from cosmos_cli.models.document import did_you_mean
+from cosmos_cli.models.expectation import owner_of
 from madns_runtime.conditions.condition import AGENT, HOST, TICK, TIME
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, schema_of
@@ -22,15 +24,16 @@ from madns_runtime.recording.records import (
     LATE_TICKS,
     LOG,
     LOG_LEVELS,
+    NUMBER_KINDS,
     PROCESS,
     TICKS,
     Field,
 )
+from madns_runtime.units import conversion
 
 REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS, HEALTH))
 """Framework streams that no run in lockstep records: no time passes there that could be late."""
 NOT_A_VALUE = ("json", "packed")
-NUMBER_KINDS = ("float", "int")
 OF_DEVICES_OWN = (DEVICE_STATE, DEVICE_CLOCK, EVENTS, LOG)
 """Streams of a device beside its channels: how it fares, not what it measures."""
 INPUT_HEAD = tuple(field.name for field in schema_of(Channel(name="any")).fields[:-1])
@@ -57,6 +60,10 @@ class KnownStream:
     """Whether further fields may follow these, known only in the run."""
     sources: tuple[str, ...] | None = None
     """Full names of the devices that record it; None if they are not known, or it is of no device."""
+
+    def is_used_by(self, agents: Collection[str]) -> bool:
+        """Tell whether a device of some agents records it, or may, or it is of no device."""
+        return self.sources is None or any(owner_of(name) in agents for name in self.sources)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,6 +156,15 @@ class KnownStreams:
         for stream in (*FRAMEWORK, *own, *of_devices):
             self._streams.setdefault(stream.name, []).append(stream)
         self._devices = {each.name for each in devices}
+
+    def used_by(self, agents: Collection[str]) -> KnownStreams:
+        """Return the same with the devices of some agents alone, where these have one of a name: others may measure something else."""
+        chosen = copy.copy(self)
+        chosen._streams = {
+            name: [each for each in found if each.is_used_by(agents)] or found
+            for name, found in self._streams.items()
+        }
+        return chosen
 
     def of(self, name: str) -> list[KnownStream]:
         """Return the streams of a name: of the agents, of the host's half, or one of each; or of machines or devices."""
@@ -273,6 +289,19 @@ class KnownStreams:
         """Return the units in which numbers of a field are recorded, the one that was declared first before others."""
         found = (each for on in self.of(stream) for each in on.fields if each.name == field)
         return list(dict.fromkeys(each.unit for each in found if each.kind in NUMBER_KINDS))
+
+    def kinds_fault(self, stream: str, field: str) -> str | None:
+        """Return that devices measure different things by a field of one name, of which no bounds are; None if they do not."""
+        units = self._units(stream, field)
+        if self.roles(stream) != {"device"} or all(
+            conversion(units[0], each) is not None for each in units
+        ):
+            return None
+        told = " and in ".join(each or "1" for each in units)
+        return (
+            f"devices record {field} of stream {stream} in {told}, which do not convert:"
+            " name agents whose devices measure the same, one check for each kind"
+        )
 
     def apart_fault(self, stream: str, field: str = "") -> str | None:
         """Return why nothing can wait for a value of a stream in the run; None if it can."""

@@ -245,7 +245,9 @@ def _check(
     wrong, odd = ask_executor(scenario)
     faults += [document.fault(EXECUTOR_KIND, wrong)] if wrong else []
     remarks = (*answers.remarks, *([document.fault(EXECUTOR_KIND, odd)] if odd else []))
-    declared = answers.streams and every_stream(answers.streams, answers.agent_streams)
+    declared = (
+        None if answers.streams is None else every_stream(answers.streams, answers.agent_streams)
+    )
     streams = KnownStreams(declared, devices, is_partial=answers.parameters is None)
     timeline, checks = NO_TIMELINE, ResolvedChecks((), ())
     if not _OF_ACTIONS & broken.keys():

@@ -26,16 +26,11 @@ class ParameterAnswers:
 def of_all_agents(own: ParameterAnswers, rules: Sequence[ParameterAnswers]) -> dict[str, Any]:
     """Return the answers of all sets of parameters together, each for its agents, as fields of `PluginAnswers`."""
     ruled = {agent for rule in rules for agent in rule.agents}
-    streams = own.streams
-    for rule in rules:
-        known = {(each.role, each.name) for each in streams or ()}
-        more = [each for each in rule.streams or () if (each.role, each.name) not in known]
-        streams = None if streams is None else (*streams, *more)
     return {
         "agent_parameters": tuple(
             AgentParameters(agents=rule.agents, parameters=rule.parameters) for rule in rules
         ),
-        "streams": streams,
+        "streams": own.streams,
         "agent_streams": tuple(
             AgentStreams(agents=rule.agents, streams=rule.streams)
             for rule in rules

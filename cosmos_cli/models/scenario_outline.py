@@ -22,6 +22,7 @@ from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test
 from cosmos_cli.models.test_settings import SECTION, giving_way, test_overrides
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.variables import substitute_variables
+from madns_runtime.bounded_files import real_path
 from madns_runtime.similar_words import most_similar
 
 
@@ -37,6 +38,8 @@ class ScenarioOutline:
     """The folder that travels with it, from which relative files are found."""
     settings: Mapping[str, Any]
     """`test.set` as it is written, variables and all."""
+    bases: frozenset[Path]
+    """Files that it extends, directly or not, with links followed."""
 
     def overrides(self, given: Sequence[str] = (), *, is_shortened: bool = True) -> list[str]:
         """
@@ -129,6 +132,7 @@ def read_outline(path: Path) -> ScenarioOutline:
         document=document,
         root=source.root,
         settings=settings if isinstance(settings, dict) else {},
+        bases=frozenset(real_path(Path(file)) for file in source.files[1:]),
     )
 
 

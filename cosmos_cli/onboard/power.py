@@ -18,7 +18,7 @@ from cosmos_cli.onboard.request_loop import (
     verb,
 )
 from cosmos_cli.onboard.scratch import scratch_file
-from madns_runtime.processes import NOT_THERE
+from madns_runtime.processes import NOT_THERE, read_environment
 
 COMMANDS = (("reboot",), ("systemctl", "reboot"), ("shutdown", "-r", "now"))
 TOOL_FOLDERS = "/usr/sbin:/sbin:/usr/bin:/bin"
@@ -26,8 +26,6 @@ ORDER_TIMEOUT_S = 5.0
 """A reboot that was begun may answer or not; one that is refused says so sooner."""
 MODULES = (b"madns_runtime.agent", b"madns_runtime.host")
 """Programs of a run, as the command line names them that everybody may read."""
-ENVIRONMENT_BYTES_MAX = 8 * 1024**2
-"""No kernel takes a larger one, as the stack is limited by default."""
 COMMAND_BYTES_MAX = 65_536
 OTHERS_MAX = 100
 
@@ -73,10 +71,8 @@ def runs_besides(living: Iterable[Mapping[str, PlainValue]]) -> list[str]:
 
 def _run_directory(pid: int) -> str:
     """Return the directory of the run that a process belongs to; "" for none."""
-    with open(f"/proc/{pid}/environ", "rb") as file:
-        variables = file.read(ENVIRONMENT_BYTES_MAX).split(b"\0")
     mark = f"{MARK}=".encode()
-    found = next((each for each in variables if each.startswith(mark)), mark)
+    found = next((each for each in read_environment(pid) if each.startswith(mark)), mark)
     return found[len(mark) :].decode(errors="replace")
 
 

@@ -26,6 +26,7 @@ from madns_runtime.processes import (
     is_running,
     list_processes,
     read_boot_id,
+    read_environment,
     read_start_ticks,
 )
 
@@ -327,7 +328,7 @@ def started_with(variable: str, value: str) -> list[int]:
     found = []
     for pid in process_numbers():
         try:
-            is_marked = mark in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+            is_marked = mark in read_environment(pid)
         except NOT_THERE:  # another user's, or it has just ended
             continue
         if is_marked and pid != os.getpid() and read_start_ticks(pid) is not None:

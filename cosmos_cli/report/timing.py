@@ -48,7 +48,7 @@ def tick_blocks(table: RecordedTable, run: RecordedRun) -> list[Block]:
 
 
 def _told_misses(run: RecordedRun) -> dict[str, int]:
-    """Return missed ticks by agent as run.json counts them: those that were told, and those that nobody told of."""
+    """Return missed ticks by agent: those that late_ticks tells, and by run.json those that nobody told of."""
     told = recorded_causes(run.tables.get("late_ticks"))
     absent = mapping_at(run.document, "timing", "causes_by_agent")
     return {

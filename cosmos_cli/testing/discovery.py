@@ -22,7 +22,7 @@ from madns_runtime.errors import MissingExtraError
 SUFFIXES: Final = (".yaml", ".yml")
 FILES_MAX: Final = 10_000
 CASES_MAX: Final = 20_000
-_SIMULATION: Final = re.compile(r"""(?:^|[{,])\s*["']?simulation["']?\s*:""", re.MULTILINE)
+_SIMULATION: Final = re.compile(r"""(?:^|[{,])[ \t]*["']?simulation["']?[ \t]*:""", re.MULTILINE)
 _FIRST: Final = re.compile(r"^(?:---)?([ \t]*)(?!---)([^\s#%])", re.MULTILINE)
 """The indentation and the first character of what is written at the top level."""
 DEFAULT_FOLDERS: Final = (Path("scenarios"), Path())
@@ -46,7 +46,7 @@ def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
     Return the scenarios of files, and those in and below folders.
 
     A file that is named is one; of a folder's files those are that have a name and a simulation; one that cannot be
-    read is at fault if it seems to have them. Left out are what travels with no scenario either (folders whose name
+    read is at fault if it seems to have them. One without a simulation that another one extends is a base of it. Left out are what travels with no scenario either (folders whose name
     begins with a dot, runs, virtual environments, caches) and links to folders.
 
     Raises:
@@ -64,7 +64,17 @@ def find_scenarios(paths: Sequence[Path]) -> FoundScenarios:
             if real_path(file) not in seen:
                 seen.add(real_path(file))
                 _add(found, file, is_named=is_named)
+    _leave_out_bases(found, {real_path(path) for path in paths})
     return found
+
+
+def _leave_out_bases(found: FoundScenarios, named: set[Path]) -> None:
+    """Leave out what has no simulation, alone or by what it extends, and gets one in a scenario that extends it."""
+    bases = {base for outline in found.outlines for base in outline.bases} - named
+    for outline in list(found.outlines):
+        if "simulation" not in outline.document.value and real_path(outline.path) in bases:
+            found.outlines.remove(outline)
+            found.others.append(outline.path)
 
 
 def _all_below(folder: Path, links: list[Path]) -> list[tuple[Path, bool]]:
@@ -129,10 +139,10 @@ def _has_scenarios_keys(text: str) -> bool:
     if first is None:
         return False
     indent, letter = first.groups()
-    before = r"(?:^|[{,])\s*" if letter == "{" else rf"^[ \t]{{0,{len(indent) + 1}}}"
+    before = r"(?:^|[{,])[ \t]*" if letter == "{" else rf"^[ \t]{{0,{len(indent) + 1}}}"
 
     def has(key: str) -> bool:
-        return re.search(rf"""(?m){before}["']?{key}["']?\s*:""", text) is not None
+        return re.search(rf"""(?m){before}["']?{key}["']?[ \t]*:""", text) is not None
 
     return has("extends") or (has("name") and has("agents"))
 

@@ -53,6 +53,9 @@ class RecordedTable(Protocol):
     def fields(self) -> tuple[Field, ...]:
         """The recorded fields with their units; t_s, simulated time, first if it was made of a tick."""
 
+    def unit(self, source: str, name: str) -> str:
+        """Return the unit of a source's values of a field: its own one, where those of other devices measure something else."""
+
     def has(self, *names: str) -> bool:
         """Tell whether the table has all these columns."""
 

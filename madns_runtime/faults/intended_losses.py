@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -84,11 +84,18 @@ class IntendedLosses:
         absence = self._absences.get(agent)
         return absence.returns_s if absence is not None and absence.is_away else None
 
-    def are_expected(self, before_s: float) -> bool:
-        """Tell whether an agent is still to return before a simulated time, s."""
+    def are_expected(self, is_in_time: Callable[[str, float], bool]) -> bool:
+        """
+        Tell whether an agent is still to return.
+
+        Args:
+            is_in_time: Tells of an agent and the simulated time of its return, s, whether that is soon enough.
+        """
         return any(
-            absence.is_away and absence.returns_s is not None and absence.returns_s < before_s
-            for absence in self._absences.values()
+            absence.is_away
+            and absence.returns_s is not None
+            and is_in_time(agent, absence.returns_s)
+            for agent, absence in self._absences.items()
         )
 
     def overdue(self, t_s: float, patience_s: float = RETURN_S_MAX) -> dict[str, str]:

@@ -11,11 +11,10 @@ from madns_runtime.lockstep import frames
 from madns_runtime.lockstep.host_core import LockstepCore
 from madns_runtime.protocol.codec import pack
 from madns_runtime.protocol.messages import AgentFault
-from madns_runtime.timing.rate import count_ticks
+from madns_runtime.timing.rate import TIME_EPSILON_S, has_tick_from
 
 RESTART_DELAY_S: Final = 0.2
 """Simulated time from the loss of an agent that agents.restarts_max gives another start to its return."""
-TIME_EPSILON_S: Final = 1e-9
 
 
 def _nobody_waits(agent: str) -> None:
@@ -39,8 +38,7 @@ class Absences:
         config = core.config
         self._restarts_max = config.agents.restarts_max
         self._tick_hz = config.agents.tick_hz
-        ticks = count_ticks(config.time.duration_s, config.agents.tick_hz)
-        self._last_tick_s = (ticks - 1) / config.agents.tick_hz
+        self._duration_s = config.time.duration_s
         self._goes_on = config.on_agent_loss == "continue"
         self._account = core.account
         self._pool = core.pool
@@ -110,7 +108,7 @@ class Absences:
 
     def has_tick_from(self, t_s: float) -> bool:
         """Tell whether a tick is left for an agent that returns at simulated time *t_s*, s."""
-        return t_s <= self._last_tick_s + TIME_EPSILON_S
+        return has_tick_from(t_s, self._duration_s, self._tick_hz)
 
     def bring_back(self, number: int, settle: Callable[[], None]) -> None:
         """

@@ -26,7 +26,7 @@ SUMMARY_BYTES_MAX = 1024 * 1024
 """A summary is figures; what is longer belongs into a stream of records."""
 SUMMARY_LEVELS_MAX = 200
 """Lists and mappings of a summary in each other: it lies in the host's result, and that in messages and in run.json, of
-which none may have 255 levels."""
+which none may have 255 levels. An agent's has fewer: it travels in a message."""
 NOT_FINITE_CHECK = "summary.not_finite"
 
 

@@ -280,14 +280,14 @@ class HostLinks:
         header = Header.peek(data)
         fault = self._find_fault(header, len(data))
         if header is None or fault is not None:
-            self._refuse_forged(fault or "short")
+            self._refuse_packet(fault or "short")
             return None
         peer = self._by_index[header.agent_index]
         link = peer.link
         if link is None or header.incarnation_id != link.incarnation_id:
             link = self._receive_stranger(peer, header, data, now_s)
         elif not link.receive_datagram(data, now_s):
-            if link.find_fault(data) is not None:
+            if link.was_forged:
                 self._drop_behind()
             return None
         if link is None:
@@ -297,7 +297,7 @@ class HostLinks:
         self._dirty.add(peer.index)
         return peer, link
 
-    def _refuse_forged(self, reason: str) -> None:
+    def _refuse_packet(self, reason: str) -> None:
         self.refused[reason] += 1
         self._drop_behind()
 
@@ -326,7 +326,7 @@ class HostLinks:
         wire = self._wire
         seal = Seal.derive(wire.run_key, wire.session, peer.index, header.incarnation_id, Role.HOST)
         if (fault := seal.find_fault(data)) is not None:
-            self._refuse_forged(fault)
+            self._refuse_packet(fault)
             return None
         # Only for one who has the key: a link takes several times as long to make as a seal.
         link = Link(seal=seal, limits=wire.limits)

@@ -41,7 +41,7 @@ class Link:
     One peer's conversation.
 
     What one half of it does alone is that half's method, handed out without a call between: see
-    `Seal` for `find_fault`, `Incoming` for `open_best` and `next_message`, `Outgoing` for the others.
+    `Incoming` for `open_best` and `next_message`, `Outgoing` for the others.
     """
 
     __slots__ = (
@@ -51,7 +51,6 @@ class Link:
         "_packets",
         "_seal",
         "datagrams_to_send",
-        "find_fault",
         "get_timer",
         "handle_timer",
         "incarnation_id",
@@ -60,11 +59,14 @@ class Link:
         "open_best",
         "peer_prefix",
         "seal_best",
+        "was_forged",
     )
 
     def __init__(self, *, seal: Seal, limits: LinkLimits = LinkLimits()) -> None:  # noqa: B008 - frozen
         self._counters = counters = LinkCounters()
         self._seal = seal
+        self.was_forged = False
+        """Whether the datagram that was refused last is not from this peer, or was changed on the way."""
         self.incarnation_id = seal.incarnation_id
         """Incarnation of the agent's process in this conversation."""
         self.peer_prefix = seal.peer_prefix
@@ -74,7 +76,6 @@ class Link:
         self._outgoing = outgoing = Outgoing(
             seal, limits, counters=counters, packets=packets, incoming=incoming
         )
-        self.find_fault = seal.find_fault
         self.open_best = incoming.open_best
         self.next_message = incoming.next_message
         self.seal_best = outgoing.seal_best
@@ -96,22 +97,6 @@ class Link:
         """Return the agent's end of a conversation; see `datagram.derive_keys` for the arguments."""
         return cls(
             seal=Seal.derive(run_key, session, agent_index, incarnation_id, Role.AGENT),
-            limits=limits,
-        )
-
-    @classmethod
-    def for_host(
-        cls,
-        run_key: bytes,
-        session: bytes,
-        agent_index: int,
-        incarnation_id: int,
-        *,
-        limits: LinkLimits = LinkLimits(),  # noqa: B008 - frozen
-    ) -> Link:
-        """Return the host's end of a conversation; see `datagram.derive_keys` for the arguments."""
-        return cls(
-            seal=Seal.derive(run_key, session, agent_index, incarnation_id, Role.HOST),
             limits=limits,
         )
 
@@ -206,9 +191,11 @@ class Link:
             False if it was refused and counted: not from this peer, changed, repeated or malformed.
         """
         self._outgoing.now_s = now_s
-        fault = self._seal.find_fault(data) or self._accept(data, now_s)
+        forgery = self._seal.find_fault(data)
+        fault = forgery or self._accept(data, now_s)
         if fault is None:
             return True
+        self.was_forged = forgery is not None
         self.refuse(fault)
         return False
 

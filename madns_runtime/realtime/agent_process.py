@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import groupby
 from typing import Any
 
 from madns_runtime.config import AgentLaunch
@@ -23,7 +24,7 @@ from madns_runtime.reactor.watchdog import end_after_hang_up
 from madns_runtime.realtime.agent import AgentRunner
 from madns_runtime.realtime.agent_calls import LoopSeat
 from madns_runtime.realtime.agent_report import AgentOutcome
-from madns_runtime.realtime.packs import Pack, phase_of
+from madns_runtime.realtime.packs import Pack
 from madns_runtime.realtime.process_port import ProcessPort
 from madns_runtime.timing.pack_split import split_into_packs
 
@@ -111,10 +112,13 @@ class AgentProcess:
     def _make_runners(self) -> list[AgentRunner]:
         names_here = [seat.name for seat in self._seats]
         self._process = process = ProcessPort(self._launch, self._reactor, len(names_here))
-        for names in split_into_packs(names_here):
-            pack = Pack(phase_of(names, self._launch), reactor=self._reactor, process=process)
-            self._packs |= dict.fromkeys(names, pack)
-            process.arms.append(pack.arm)
+        phases_s = self._launch.phases_s
+        for together in split_into_packs(names_here):
+            # On a machine that has returned, where some agents are missing, they may be of several packs.
+            for phase_s, names in groupby(together, lambda name: phases_s.get(name, 0.0)):
+                pack = Pack(phase_s, reactor=self._reactor, process=process)
+                self._packs |= dict.fromkeys(names, pack)
+                process.arms.append(pack.arm)
         if len(process.arms) == 1:
             self._reactor.expect_period(1.0 / self._launch.config.agents.tick_hz)
         return [self._make_runner(seat) for seat in self._seats]

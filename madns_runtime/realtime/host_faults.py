@@ -15,6 +15,7 @@ from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_core import RealtimeCore
 from madns_runtime.timeline import fault_kinds as words
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
+from madns_runtime.timing.rate import has_tick_from
 
 
 class HostFaults:
@@ -30,6 +31,8 @@ class HostFaults:
         self.intended = IntendedLosses()
         self._goes_on = config.on_agent_loss == "continue"
         self._duration_s = config.time.duration_s
+        self._tick_hz = config.agents.tick_hz
+        self._phases_s = core.launch.phases_s
         self._is_stopped = False
         self._port = port
         self._half = half
@@ -88,9 +91,6 @@ class HostFaults:
         now_s = self._port.now_s()
         returns_s = None if after_s is None else now_s + after_s
         why = words.killed_words(action)
-        value = math.nan
-        if after_s is not None and now_s + max(after_s, RETURN_S_MIN) < self._duration_s:
-            value = after_s  # else no tick would be left for it: as in lockstep it stays away
         absent = [] if after_s is None else self._worn_out(action.agents)
         if absent and len(absent) == len(action.agents):
             names = ", ".join(absent)
@@ -98,6 +98,11 @@ class HostFaults:
                 f"{names}: started {INCARNATIONS_MAX} times, as often as a run takes one"
             )
         for agent in [name for name in action.agents if name not in absent]:
+            # As in lockstep, one for which no tick would be left stays away.
+            will_return = after_s is not None and self._is_in_time(
+                agent, now_s + max(after_s, RETURN_S_MIN)
+            )
+            value = after_s if after_s is not None and will_return else math.nan
             order = AgentFault(action.number, action.word, True, value, why)
             # Who is being killed is as good as gone: a second order would not be heard, and says when it returns.
             if not self.intended.is_coming(agent) and self._send(agent, order):
@@ -142,10 +147,16 @@ class HostFaults:
         self._await_returns()
 
     def _await_returns(self) -> None:
-        are_due = self.intended.are_expected(self._duration_s)
+        are_due = self.intended.are_expected(self._is_in_time)
         # A stop is no loss of those who would be back without it.
-        are_cut_off = self._is_stopped and not are_due and self.intended.are_expected(math.inf)
+        are_any = self.intended.are_expected(lambda agent, returns_s: True)
+        are_cut_off = self._is_stopped and not are_due and are_any
         self._port.session.await_returns(are_due, are_cut_off=are_cut_off)
+
+    def _is_in_time(self, agent: str, returns_s: float) -> bool:
+        """Tell whether a tick is left for an agent that returns at simulated time *returns_s*, s."""
+        phase_s = self._phases_s.get(agent, 0.0)
+        return has_tick_from(returns_s, self._duration_s, self._tick_hz, phase_s)
 
     # Messages -------------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from madns_runtime.realtime.agent_report import AgentOutcome
 
 REASON_BYTES_MAX: Final = 2048
 READ_BYTES_MAX: Final = 65_536
-"""As many as such a pipe holds: whole lines."""
+"""Of one turn: a pipe may hold more, as those of kernels with large pages do."""
 
 
 class OutcomePipe:
@@ -33,17 +33,17 @@ class OutcomePipe:
     def __init__(self) -> None:
         self.read_fd, self.write_fd = os.pipe()
         os.set_blocking(self.read_fd, False)
+        self._begun = b""
+        """The line of which the rest is still in the pipe."""
 
     def read(self) -> list[dict[str, Any]]:
-        """Return what was told since the last time."""
+        """Return what was told since the last time; some of it the next time, where it is very much."""
         try:
-            return [
-                orjson.loads(line)
-                for line in os.read(self.read_fd, READ_BYTES_MAX).split(b"\n")
-                if line
-            ]
+            told = self._begun + os.read(self.read_fd, READ_BYTES_MAX)
         except BlockingIOError:
             return []
+        *lines, self._begun = told.split(b"\n")
+        return [orjson.loads(line) for line in lines]
 
     def write_failure(self, reason: str) -> None:
         """Leave word of what ended the process of all its agents: it is none's in particular."""

@@ -9,16 +9,12 @@ the shared deadline.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from time import monotonic
 from typing import Protocol
 
-from madns_runtime.config import AgentLaunch
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.realtime.process_port import ProcessPort
 from madns_runtime.realtime.wake_lead import WAIT_S_MAX, WakeLead
-from madns_runtime.timing.pack_split import packs_on_machine
-from madns_runtime.timing.rate import stagger
 
 
 class PackMember(Protocol):
@@ -133,20 +129,3 @@ class Pack:
         until_s = min(self._due_s, ordered_s + WAIT_S_MAX)
         while now_s < until_s:
             now_s = monotonic()
-
-
-def phase_of(pack: Sequence[str], launch: AgentLaunch) -> float:
-    """
-    Return the phase of a pack, s: all packs of the run are spread over the period.
-
-    Args:
-        pack: Its agents.
-        launch: Of their machine.
-    """
-    agents, elsewhere = launch.config.agents, launch.packs_elsewhere
-    names = agents.resolved_names() if elsewhere is None else launch.agents
-    before, behind = elsewhere or (0, 0)
-    packs = packs_on_machine(names, agents.per_process)
-    number = next(number for number, names in enumerate(packs) if pack[0] in names)
-    count = before + len(packs) + behind
-    return stagger(before + number, count, agents.tick_hz, phase=agents.phase)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from types import NoneType
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from madns_runtime.recording.records import WHOLE_MAX
+
 Columns = dict[str, NDArray[Any]]
-WHOLE_MAX: Final = 2**53
-"""Up to here every whole number is a float."""
 _NUMBERS = frozenset({float, int, bool, NoneType})
 
 

@@ -10,6 +10,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from madns_runtime.recording.records import WHOLE_MAX
+
 if TYPE_CHECKING:
     # Who only cleans values, as the operator's side does, is spared numpy.
     from madns_runtime.recording.recorder import Recorder
@@ -18,7 +20,6 @@ AGENTS_TOLD_MAX = 64
 """Agents whose values a report on a run's progress tells; the others are counted."""
 TEXT_CHARACTERS_MAX = 16
 """Of a text; so cut, the values of all columns fit the datagram of a ping."""
-WHOLE_MAX = 2**53
 
 Value = float | str | None
 

@@ -18,7 +18,8 @@ import orjson
 
 from madns_runtime.bounded_files import open_regular_file
 from madns_runtime.errors import MachineError
-from madns_runtime.recording.columns import WHOLE_MAX, Columns, column_of, joined_column
+from madns_runtime.recording.columns import Columns, column_of, joined_column
+from madns_runtime.recording.records import WHOLE_MAX
 from madns_runtime.recording.stream_rules import CONTROL_KEYS
 
 BLOCK_BYTES = 1 << 17

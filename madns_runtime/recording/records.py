@@ -11,9 +11,11 @@ before it was; the last line of a stream that was closed properly is
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 SCHEMA_VERSION = 1
+WHOLE_MAX: Final = 2**53
+"""Up to here every whole number is a float, and all readers of JSON agree on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +35,8 @@ class Field:
 
 FIELD_KINDS = ("float", "int", "str", "bool", "json", "packed")
 """All kinds of fields."""
+NUMBER_KINDS = ("float", "int")
+"""Kinds of numbers."""
 
 
 @dataclass(frozen=True, slots=True)

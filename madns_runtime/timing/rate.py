@@ -15,6 +15,7 @@ from madns_runtime.errors import ConfigurationError, IllegalTransition
 
 COUNT_ROUNDING = 1e-9
 """duration times rate this close to a whole number is that number: 0.7 s at 10 Hz are 7 ticks."""
+TIME_EPSILON_S = 1e-9
 GOLDEN_FRACTION = 0.6180339887498949
 
 
@@ -39,6 +40,20 @@ def last_period_s(duration_s: float, tick_hz: float) -> float:
     or, with a phase, up to 12 s.
     """
     return max(duration_s, count_ticks(duration_s, tick_hz) / tick_hz)
+
+
+def has_tick_from(t_s: float, duration_s: float, tick_hz: float, phase_s: float = 0.0) -> bool:
+    """
+    Tell whether a run still has a tick for an agent that returns to it.
+
+    Args:
+        t_s: Simulated time of its return, s.
+        duration_s: Of the run, s.
+        tick_hz: Its rate, Hz.
+        phase_s: Offset of its deadlines, s; in lockstep no agent has one.
+    """
+    last_s = (count_ticks(duration_s, tick_hz) - 1) / tick_hz + phase_s
+    return t_s <= last_s + TIME_EPSILON_S
 
 
 class TickTiming(NamedTuple):
@@ -333,15 +348,23 @@ def stagger(
     *,
     phase: Literal["staggered", "aligned"] = "staggered",
 ) -> float:
-    """
-    Return the phase of agent *index* of *count*, in [0, 1 / tick_hz), s.
+    """Return the phase of agent *index* of *count*, in [0, 1 / tick_hz), s; see `staggered`."""
+    return staggered(count, tick_hz, phase=phase)[index]
 
-    The phases of all agents divide the period evenly. They follow the order of the golden section's
-    multiples, so that the few agents of one machine, which are neighbours by index, are spread over
-    the period as well.
+
+def staggered(
+    count: int, tick_hz: float, *, phase: Literal["staggered", "aligned"] = "staggered"
+) -> list[float]:
     """
-    if phase == "aligned" or count <= 1:
-        return 0.0
-    position = index * GOLDEN_FRACTION % 1.0
-    rank = sum(other * GOLDEN_FRACTION % 1.0 < position for other in range(count))
-    return rank / count / tick_hz
+    Return the phases of *count* agents, each in [0, 1 / tick_hz), s.
+
+    They divide the period evenly, in the order of the golden section's multiples, so that the few agents of one
+    machine, which are neighbours by index, are spread over the period as well. Aligned agents have none.
+    """
+    if phase == "aligned":
+        return [0.0] * count
+    ranked = sorted(range(count), key=lambda index: index * GOLDEN_FRACTION % 1.0)
+    phases_s = [0.0] * count
+    for rank, index in enumerate(ranked):
+        phases_s[index] = rank / count / tick_hz
+    return phases_s

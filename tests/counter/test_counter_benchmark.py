@@ -19,11 +19,21 @@ def table(**missed):
 
 
 @pytest.mark.parametrize(
-    ("late", "missed"), [({}, 3), ({"a": [1, 2]}, 3), ({"a": [1, 2, 5], "b": [9]}, 8)]
+    ("late", "absent", "missed"),
+    [
+        ({}, None, 3),
+        ({"a": [1, 2]}, 0, 3),
+        ({"a": [1, 2, 5], "b": [9]}, 0, 8),
+        ({"a": [1, 2]}, 65, 68),
+        ({}, 68, 68),
+    ],
 )
-def test_missed_ticks_that_no_tick_followed_count(late, missed):
+def test_missed_ticks_that_no_tick_followed_count_and_those_of_a_killed_agent(late, absent, missed):
     run = RecordedRun(
-        document={"simulation": {"agents": {"a": {"sent": 7, "returned": 6, "lost": 1}}}},
+        document={
+            "simulation": {"agents": {"a": {"sent": 7, "returned": 6, "lost": 1}}},
+            "timing": {"causes_by_agent": {"a": {"absent": absent}}},
+        },
         tables={"ticks": table(a=[0, 1, 0, 2]), "late_ticks": table(**late)},
         config=None,
     )

@@ -458,13 +458,13 @@ def test_a_loss_that_was_ordered_is_excused_once_and_a_return_that_failed_is_not
     assert losses.take("a", 1) == "killed on purpose"
     assert losses.take("a", 1) is None
     assert losses.take("b", 1) is None
-    assert losses.are_expected(60.0)
+    assert losses.are_expected(lambda agent, returns_s: (agent, returns_s) == ("a", 20.0))
     assert losses.overdue(24.0) == {}
     assert "was to return at t = 20 s" in losses.overdue(60.0)["a"]
 
     losses.returned("a")
     assert losses.overdue(60.0) == {}
-    assert not losses.are_expected(60.0)
+    assert not losses.are_expected(lambda agent, returns_s: (agent, returns_s) == ("a", 20.0))
     assert (losses.names(), losses.incarnations("a")) == (["a"], [1])
 
 

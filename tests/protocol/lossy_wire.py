@@ -6,6 +6,8 @@ import heapq
 import random
 from dataclasses import dataclass, field
 
+from harness.host_links import host_link
+
 from madns_runtime.protocol.deadlines import BrokenDeadline
 from madns_runtime.protocol.incoming import Received
 from madns_runtime.protocol.link import Link
@@ -68,7 +70,7 @@ class LossyWire:
         self.drop = drop or (lambda datagram, t_s: False)
         self.now_s = 1000.0
         self.agent = End(Link.for_agent(RUN_KEY, SESSION, 7, 99, limits=limits))
-        self.host = End(Link.for_host(RUN_KEY, SESSION, 7, 99, limits=limits))
+        self.host = End(host_link(RUN_KEY, SESSION, 7, 99, limits=limits))
         self.carried: list[tuple[float, bool, bytes]] = []
         self._events: list[tuple[float, int, object, bytes]] = []
         self._count = 0

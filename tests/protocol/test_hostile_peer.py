@@ -6,6 +6,7 @@ import contextlib
 import random
 
 import pytest
+from harness.host_links import host_link
 from lossy_wire import RUN_KEY, SESSION
 from test_link_hostile import frame
 
@@ -17,7 +18,6 @@ from madns_runtime.protocol.datagram import (
     Seal,
     derive_keys,
 )
-from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.link_settings import LinkLimits, SendQueueFull
 from madns_runtime.protocol.messages import Service
 from madns_runtime.protocol.sending import LOST_PACKETS_MAX
@@ -99,7 +99,7 @@ def unacknowledged_bytes(stream):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_peer_that_lies_in_every_field_costs_bounded_memory_and_no_standstill(seed):
-    host = Link.for_host(RUN_KEY, SESSION, 7, 99, limits=LIMITS)
+    host = host_link(RUN_KEY, SESSION, 7, 99, limits=LIMITS)
     liar = Liar(seed, host)
     chance = liar.chance
     now_s = 1.0

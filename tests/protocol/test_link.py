@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from harness.host_links import host_link
 from lossy_wire import RUN_KEY, SESSION, Faults, LossyWire
 
 from madns_runtime.errors import MadnsError, MessageTooLarge
@@ -32,7 +33,7 @@ def make_pair(**limits):
     options = {"limits": LinkLimits(**limits)} if limits else {}
     return (
         Link.for_agent(RUN_KEY, SESSION, 1, 2, **options),
-        Link.for_host(RUN_KEY, SESSION, 1, 2, **options),
+        host_link(RUN_KEY, SESSION, 1, 2, **options),
     )
 
 

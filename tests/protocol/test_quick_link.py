@@ -4,6 +4,7 @@ import random
 from struct import Struct
 
 import pytest
+from harness.host_links import host_link
 from hypothesis import given
 from hypothesis import strategies as st
 from lossy_wire import RUN_KEY, SESSION
@@ -39,7 +40,7 @@ BEST, RELIABLE, SYNC = Service
 def make_pair():
     return (
         Link.for_agent(RUN_KEY, SESSION, 1, 2),
-        Link.for_host(RUN_KEY, SESSION, 1, 2),
+        host_link(RUN_KEY, SESSION, 1, 2),
     )
 
 

@@ -101,7 +101,7 @@ def test_every_pack_of_a_process_is_timed_anew_with_the_clock_that_they_share(mo
     config = SimpleNamespace(agents=Agents(count=9, tick_hz=10.0, per_process=9))
     process = AgentProcess.__new__(AgentProcess)
     process._reactor = SimpleNamespace(call_at=lambda due_s, call: None, end_if_forked=lambda: None)
-    process._launch = SimpleNamespace(config=config, packs_elsewhere=None)
+    process._launch = SimpleNamespace(config=config, phases_s={})
     process._seats = [SimpleNamespace(name=name) for name in config.agents.resolved_names()]
     process._program, process._supervisor = RoleProgram(make=object, parameters=None), SUPERVISOR
     process._packs, process._incarnations, process._counted = {}, {}, {}
@@ -111,6 +111,24 @@ def test_every_pack_of_a_process_is_timed_anew_with_the_clock_that_they_share(mo
     assert len(packs) == 9
     assert process_port.arms == [pack.arm for pack in dict.fromkeys(packs)]
     assert len(process_port.arms) == 2
+
+
+def test_agents_of_several_packs_that_share_a_process_keep_their_phases(monkeypatch):
+    """As on a machine that has returned, without agents that may not be started again."""
+    monkeypatch.setattr(agent_process, "ProcessPort", lambda *_: SimpleNamespace(agents=4, arms=[]))
+    monkeypatch.setattr(agent_process, "AgentRunner", lambda seat, *_, **more: more["pack"])
+    phases_s = {"a": 0.3, "b": 0.3, "c": 0.05, "d": 0.05}
+    process = AgentProcess.__new__(AgentProcess)
+    process._reactor = SimpleNamespace(call_at=lambda due_s, call: None, end_if_forked=lambda: None)
+    process._launch = SimpleNamespace(config=None, phases_s=phases_s)
+    process._seats = [SimpleNamespace(name=name) for name in phases_s]
+    process._program, process._supervisor = RoleProgram(make=object, parameters=None), SUPERVISOR
+    process._packs, process._incarnations, process._counted = {}, {}, {}
+
+    packs = process._make_runners()
+
+    assert [pack.phase_s for pack in packs] == [0.3, 0.3, 0.05, 0.05]
+    assert len(set(packs)) == 2
 
 
 @pytest.mark.parametrize(("t_s", "times"), [(-0.2, 1), (0.0, 0)])

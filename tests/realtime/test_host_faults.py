@@ -37,17 +37,21 @@ class Session:
         self.awaited = (are_due, are_cut_off)
 
 
-def some_faults(now_s: float = 10.0) -> tuple[HostFaults, Session]:
+PHASES_S = {"a": 0.0, "b": 0.5}
+"""Of ticks at 1 Hz."""
+
+
+def some_faults(now_s: float = 10.0, tick_hz: float = 20.0) -> tuple[HostFaults, Session]:
     session = Session()
     config = SimpleNamespace(
         on_agent_loss="continue",
         time=SimpleNamespace(duration_s=60.0),
         seed=1,
-        agents=SimpleNamespace(resolved_names=lambda: ("a", "b")),
+        agents=SimpleNamespace(resolved_names=lambda: ("a", "b"), tick_hz=tick_hz),
     )
     port: Any = SimpleNamespace(session=session, now_s=lambda: now_s, send=None, must_pump=False)
     core: Any = SimpleNamespace(
-        launch=SimpleNamespace(config=config),
+        launch=SimpleNamespace(config=config, phases_s=PHASES_S if tick_hz == 1.0 else {}),
         port=port,
         half=None,
         guard=None,
@@ -61,6 +65,19 @@ def an_action(number: int, word: str, *agents: str, for_s: float | None = None) 
     return TimelineAction(
         number=number, word=word, agents=agents, parameters={}, t_s=10.0, for_s=for_s
     )
+
+
+@pytest.mark.parametrize(
+    ("for_s", "returning"), [(48.9, "ab"), (49.0, "ab"), (49.1, "b"), (49.5, "b"), (49.6, "")]
+)
+def test_one_for_whom_no_tick_would_be_left_stays_away_as_in_lockstep(for_s, returning) -> None:
+    """At 1 Hz, the last tick of 60 s is at 59 s; b's is due half a second later."""
+    faults, session = some_faults(tick_hz=1.0)
+
+    faults.begin(an_action(0, "kill", "a", "b", for_s=for_s))
+
+    assert "".join(agent for agent, order in session.sent if order.value == for_s) == returning
+    assert session.awaited == (bool(returning), False)
 
 
 def test_a_second_kill_of_one_that_is_being_killed_does_not_say_when_it_returns() -> None:
@@ -128,7 +145,7 @@ def test_what_a_fault_holds_beyond_the_end_is_not_handed_in(
         on_agent_loss="continue",
         time=SimpleNamespace(duration_s=end_s),
         seed=1,
-        agents=SimpleNamespace(resolved_names=lambda: ("a", "b")),
+        agents=SimpleNamespace(resolved_names=lambda: ("a", "b"), tick_hz=20.0),
     )
     half = SimpleNamespace(
         take_now=lambda agent, message: handed_in.append(message),
@@ -136,7 +153,7 @@ def test_what_a_fault_holds_beyond_the_end_is_not_handed_in(
         intake=None,
     )
     core: Any = SimpleNamespace(
-        launch=SimpleNamespace(config=config),
+        launch=SimpleNamespace(config=config, phases_s={}),
         port=SimpleNamespace(
             session=Session(),
             now_s=lambda: now_s[0],

@@ -11,7 +11,7 @@ import pytest
 from madns_runtime.config import Agents, HostLaunch, Network, RunConfig, Timeouts, TimeSettings
 from madns_runtime.errors import PluginError
 from madns_runtime.protocol.bundle import BUNDLE, bundle_up, split
-from madns_runtime.protocol.datagram import OVERHEAD_BYTES, PREFIX, Role
+from madns_runtime.protocol.datagram import OVERHEAD_BYTES, PREFIX, Role, Seal
 from madns_runtime.protocol.host_session import HostSession
 from madns_runtime.protocol.link import Link
 from madns_runtime.protocol.link_settings import LinkSettings
@@ -178,6 +178,23 @@ def test_what_came_twice_or_of_an_earlier_process_holds_up_nothing_behind_it(
     assert checked_by(session, port, way) == [first, forged(9), second]
     assert session.peers["agent-02"].link is not None
     assert session.refused["behind_forged"] == 0
+
+
+def test_a_datagram_that_came_twice_is_checked_as_often_as_any(session, monkeypatch):
+    checks = []
+    find_fault = Seal.find_fault
+    monkeypatch.setattr(
+        Seal, "find_fault", lambda seal, data: checks.append(data) or find_fault(seal, data)
+    )
+    link = Link.for_agent(RUN_KEY, SESSION, 1, 0)
+    link.send_urgent(b"\xff", Service.BEST, 0.5)
+    (first,) = link.datagrams_to_send(0.5)
+    session.receive_data(first, ("127.0.0.1", 1), 0.5)
+    checks.clear()
+
+    session.receive_data(first, ("127.0.0.1", 1), 0.6)
+
+    assert checks == [first]
 
 
 def test_no_link_is_made_for_one_who_does_not_have_the_key(session, monkeypatch):

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from harness.host_links import host_link
 
 from madns_runtime.faults.intended_losses import IntendedLosses
 from madns_runtime.protocol.counters import LinkCounters
@@ -103,7 +104,7 @@ def test_what_earlier_incarnations_counted_stays_counted():
 def ends() -> tuple[Link, Link]:
     """Return the agent's and the host's end of one conversation."""
     key, session = bytes(32), bytes(8)
-    return Link.for_agent(key, session, 1, 7), Link.for_host(key, session, 1, 7)
+    return Link.for_agent(key, session, 1, 7), host_link(key, session, 1, 7)
 
 
 def send_best(sender: Link, receiver: Link, *, sent: int, lost: set[int]) -> None:

@@ -7,10 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from madns_runtime.config import Agents
-from madns_runtime.realtime.packs import Pack, phase_of
+from madns_runtime.realtime.packs import Pack
 from madns_runtime.realtime.wake_lead import LEAD_S_MAX, WAIT_S_MAX, WakeLead
-from madns_runtime.timing.pack_split import PACK_AGENTS_MAX, packs_on_machine, split_into_packs
+from madns_runtime.timing.pack_split import PACK_AGENTS_MAX, split_into_packs
 
 
 @pytest.mark.parametrize(
@@ -24,50 +23,6 @@ def test_packs_are_few_and_even(agents, sizes):
     assert [name for pack in packs for name in pack] == names
     assert sorted(map(len, packs)) == sorted(sizes)
     assert max(map(len, packs)) <= PACK_AGENTS_MAX
-
-
-def launch(agents, names=(), elsewhere=None):
-    return SimpleNamespace(
-        config=SimpleNamespace(agents=agents), agents=names, packs_elsewhere=elsewhere
-    )
-
-
-@pytest.mark.parametrize(
-    ("count", "per_process"), [(96, 48), (93, 47), (1000, 125), (24, 12), (50, 47)]
-)
-def test_packs_are_spread_over_the_period(count, per_process):
-    agents = Agents(count=count, tick_hz=10.0, per_process=per_process)
-    packs = packs_on_machine(agents.resolved_names(), per_process)
-    phases = sorted(phase_of(pack, launch(agents)) for pack in packs)
-
-    assert phases == pytest.approx([0.1 * number / len(packs) for number in range(len(packs))])
-
-
-def test_packs_of_all_machines_are_spread_over_the_period():
-    agents = Agents(count=24, tick_hz=10.0, per_process=3)
-    names = agents.resolved_names()
-    launches = [
-        launch(agents, names[::2], (0, 4)),
-        launch(agents, names[1::2], (4, 0)),
-    ]
-    phases = sorted(
-        phase_of(pack, each) for each in launches for pack in packs_on_machine(each.agents, 3)
-    )
-
-    assert phases == pytest.approx([0.1 * number / 8 for number in range(8)])
-
-
-def test_agents_by_themselves_keep_the_phases_they_had():
-    agents = Agents(count=24, tick_hz=100.0)
-    phases = sorted(phase_of([name], launch(agents)) for name in agents.resolved_names())
-
-    assert phases == pytest.approx([number / 24 / 100 for number in range(24)])
-
-
-def test_aligned_packs_share_the_beginning_of_the_period():
-    agents = Agents(count=24, tick_hz=100.0, per_process=24, phase="aligned")
-
-    assert phase_of(["agent-17"], launch(agents)) == 0.0
 
 
 class Member:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+import select
 import signal
 from types import SimpleNamespace
 
 import pytest
 
 from madns_runtime.config import Agents
+from madns_runtime.realtime import outcome_pipe
 from madns_runtime.realtime.agent_calls import AgentCalls
 from madns_runtime.realtime.agent_report import AgentOutcome
 from madns_runtime.realtime.outcome_pipe import OutcomePipe
@@ -32,6 +34,23 @@ def test_a_reader_that_finds_nothing_after_reaping_does_not_wait():
         signal.alarm(0)
         os.close(pipe.read_fd)
         os.close(pipe.write_fd)
+
+
+def test_words_that_are_read_in_pieces_are_whole(monkeypatch):
+    """A pipe holds more than is read at once where a kernel's pages are large."""
+    monkeypatch.setattr(outcome_pipe, "READ_BYTES_MAX", 100)
+    pipe = OutcomePipe()
+    names = [f"agent-{number:02d}" for number in range(1, 10)]
+    for name in names:
+        pipe.write_outcomes({name: AgentOutcome(as_ordered=True)})
+
+    told = []
+    while select.select([pipe.read_fd], [], [], 0)[0]:
+        told += pipe.read()
+
+    assert [each["agent"] for each in told] == names
+    for fd in (pipe.read_fd, pipe.write_fd):
+        os.close(fd)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from madns_runtime.timing.rate import (
     RealTimeFactor,
     TickTiming,
     count_ticks,
+    has_tick_from,
     last_period_s,
     stagger,
 )
@@ -459,3 +460,19 @@ def test_no_tick_is_due_behind_the_last_period_whatever_its_phase(tick_hz, durat
 
 def test_a_run_of_whole_periods_is_over_with_the_last():
     assert [last_period_s(duration_s, 10.0) for duration_s in (0.3, 0.7, 60.0)] == [0.3, 0.7, 60.0]
+
+
+@pytest.mark.parametrize(
+    ("t_s", "duration_s", "tick_hz", "phase_s", "expected"),
+    [
+        (5.0, 6.0, 1.0, 0.0, True),
+        (5.5, 6.0, 1.0, 0.0, False),
+        (5.5, 6.0, 1.0, 0.5, True),
+        (5.6, 6.0, 1.0, 0.5, False),
+        (0.6, 0.7, 10.0, 0.0, True),
+        (0.3 + 0.3 + 0.0000000001, 0.7, 10.0, 0.0, True),
+        (0.0, 0.0, 1.0, 0.0, False),
+    ],
+)
+def test_a_tick_is_left_until_the_last_one_is_due(t_s, duration_s, tick_hz, phase_s, expected):
+    assert has_tick_from(t_s, duration_s, tick_hz, phase_s) is expected

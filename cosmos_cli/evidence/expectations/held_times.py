@@ -9,7 +9,7 @@ import numpy as np
 from cosmos_cli.evidence.expectations.accumulators import Flags, Floats, holds
 from cosmos_cli.evidence.expectations.records import Batch, RecordSource
 from cosmos_cli.models.expectation import HeldBounds, owner_of, scaled
-from madns_runtime.conditions.condition import HOST, ValueBounds
+from madns_runtime.conditions.condition import HOST
 from madns_runtime.units import conversion
 
 CHANGES_MAX = 1_000_000
@@ -42,15 +42,10 @@ class HeldTimes:
         """Agents that recorded it themselves: what the host's half records of them under that name is not looked at."""
         self._names_agents = False
         """Whether the host's half says of whom its records are: none of them is of an agent that they do not name."""
-        factor = (
-            conversion(held.unit, source.unit_of(held.stream, held.field)) if held.unit else 1.0
-        )
-        if factor is not None:
-            bounds = scaled(held.bounds, factor)
-            for batch in self._batches(held, source):
-                self._add(batch, holds(bounds, batch.values), held)
-            if self._goes_back:
-                self._put_in_order(held, source, bounds)
+        for batch, states in self._batches(held, source):
+            self._add(batch, states, held)
+        if self._goes_back:
+            self._put_in_order(held, source)
 
     def during(self, agent: str, t_s: Floats) -> Flags:
         """Tell of each time whether the newest record of the condition until then holds."""
@@ -66,11 +61,15 @@ class HeldTimes:
         place = np.searchsorted(times, t_s, side="right") - 1
         return (place >= 0) & states[np.maximum(place, 0)]
 
-    def _batches(self, held: HeldBounds, source: RecordSource) -> Iterator[Batch]:
+    def _batches(self, held: HeldBounds, source: RecordSource) -> Iterator[tuple[Batch, Flags]]:
+        """Yield records that have the field, and of each whether the condition holds; none whose unit is of something else."""
         for batch in source.batches(held.stream, (held.field,)):
             self._names_agents = self._names_agents or (batch.is_of_host and batch.agent != HOST)
-            if batch.has(held.field):
-                yield batch.of(held.field)
+            unit = source.unit_of(held.stream, held.field, batch.agent)
+            factor = conversion(held.unit or unit, unit)
+            if batch.has(held.field) and factor is not None:
+                batch = batch.of(held.field)
+                yield batch, holds(scaled(held.bounds, factor), batch.values)
 
     def _add(self, batch: Batch, states: Flags, held: HeldBounds) -> None:
         if not len(states):
@@ -95,15 +94,15 @@ class HeldTimes:
                 f"{held.stream}.{held.field} of {batch.agent} changes more than {CHANGES_MAX} times between holding and not"
             )
 
-    def _put_in_order(self, held: HeldBounds, source: RecordSource, bounds: ValueBounds) -> None:
+    def _put_in_order(self, held: HeldBounds, source: RecordSource) -> None:
         """Follow those anew whose times go back, by all of their records: what is between two changes counts, too."""
         kept: dict[str, list[tuple[Floats, Flags]]] = {agent: [] for agent in self._goes_back}
         counts = dict.fromkeys(kept, 0)
-        for batch in self._batches(held, source):
+        for batch, states in self._batches(held, source):
             agent = owner_of(batch.agent)
             if agent not in kept or (batch.is_of_host and agent in self._own):
                 continue
-            kept[agent].append((batch.t_s, holds(bounds, batch.values)))
+            kept[agent].append((batch.t_s, states))
             counts[agent] += len(batch.t_s)
             if counts[agent] > CHANGES_MAX:
                 raise TooManyChanges(

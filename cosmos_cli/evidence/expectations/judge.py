@@ -33,7 +33,7 @@ from cosmos_cli.evidence.expectations.seen_words import SeenWords
 from cosmos_cli.evidence.expectations.strangers import Strangers
 from cosmos_cli.evidence.verdict import CheckResult
 from cosmos_cli.models.check_rules import OF_NUMBERS, OF_TIMES
-from cosmos_cli.models.expectation import Expectation, HeldBounds, scaled
+from cosmos_cli.models.expectation import Expectation, HeldBounds, owner_of, scaled
 from cosmos_cli.models.known_streams import REAL_TIME_ONLY
 from madns_runtime.analysis.tables import Tables
 from madns_runtime.conditions.condition import HOST, ValueBounds
@@ -176,12 +176,21 @@ class _Followed:
         self._end_s = min(duration_s, duration_s if expectation.to_s is None else expectation.to_s)
         """End of the stretch of time that a rate is of, s."""
         self._has_stream = bool(source.tables_of(expectation.stream))
-        recorded = source.unit_of(expectation.stream, expectation.field)
-        factor = conversion(expectation.unit, recorded) if expectation.unit else 1.0
         self._fault = _fault_of(expectation, source)
-        if factor is None:
-            self._fault = f"{expectation.field} is in {recorded or '1'}"
-        self._factor = factor or 1.0
+        units = {
+            name: source.unit_of(expectation.stream, expectation.field, name)
+            for name in self._names or (NOBODY,)
+        }
+        recorded = next(iter(units.values()))
+        self._factors: dict[str, float] = {}
+        """Values in each one's own unit that one in the unit of the bounds makes."""
+        for name, unit in units.items():
+            factor = (
+                conversion(expectation.unit or recorded, unit) if _has_unit(expectation) else 1.0
+            )
+            if factor is None:
+                self._fault = f"{expectation.field} is in {unit or '1'}"
+            self._factors[name] = factor or 1.0
         self.unit = self._unit(recorded)
         self._accumulators: dict[str, Accumulator] = {}
         self.words = SeenWords(expectation)
@@ -228,7 +237,7 @@ class _Followed:
             return
         accumulator = self._accumulators.get(batch.agent)
         if accumulator is None:
-            accumulator = self._accumulators[batch.agent] = self._accumulator()
+            accumulator = self._accumulators[batch.agent] = self._accumulator(batch.agent)
         accumulator.take(batch.t_s, batch.values, batch.places)
 
     def begins_again(self) -> bool:
@@ -240,12 +249,12 @@ class _Followed:
             each.look_again()
         return True
 
-    def _accumulator(self) -> Accumulator:  # noqa: PLR0911 - a table of what each statistic is
+    def _accumulator(self, agent: str) -> Accumulator:  # noqa: PLR0911 - a table of what each statistic is
         expectation = self.expectation
-        bounds = self._bounds()
+        bounds = self._bounds(agent)
         if expectation.event:
             return Occurrences(expectation.event)
-        when = None if expectation.when is None else scaled(expectation.when, self._factor)
+        when = None if expectation.when is None else scaled(expectation.when, self._factors[agent])
         match expectation.statistic:
             case "last":
                 return Last(bounds)
@@ -270,12 +279,12 @@ class _Followed:
             case _:
                 return Unlike(bounds) if bounds.text is not None else Worst(bounds)
 
-    def _bounds(self) -> ValueBounds:
-        """Return the bounds of the statistic in the unit of the records; times and numbers have their own."""
+    def _bounds(self, agent: str) -> ValueBounds:
+        """Return the bounds of the statistic in the unit of an agent's records; times and numbers have their own."""
         expectation = self.expectation
         if expectation.statistic in (*OF_NUMBERS, *OF_TIMES):
             return expectation.bounds
-        return scaled(expectation.bounds, self._factor)
+        return scaled(expectation.bounds, self._factors[agent])
 
     def outcomes(self, earlier: Mapping[str, _Earlier]) -> dict[str, ExpectationOutcome]:
         """Return what each agent came to, given the same of the expectations before."""
@@ -285,7 +294,7 @@ class _Followed:
         for agent in self._names or (NOBODY,):
             accumulator = self._accumulators.get(agent)
             if accumulator is None and self._may_be_none:
-                accumulator = self._accumulator()
+                accumulator = self._accumulator(agent)
             found[agent] = self._outcome(agent, accumulator, after)
         return found
 
@@ -311,10 +320,12 @@ class _Followed:
         got, t_s = (None, None) if accumulator is None else accumulator.result()
         if got is None or not np.isfinite(got):
             return ExpectationOutcome(got=None, t_s=t_s, passed=False, why=self._fault or "")
-        bounds = self._bounds()
+        bounds = self._bounds(agent)
         passed = got == 0.0 if bounds.text is not None else bounds.holds(got)
         is_value = expectation.statistic not in (*OF_NUMBERS, *OF_TIMES)
-        shown = converted(got, 1.0 / self._factor) if is_value and bounds.text is None else got
+        shown = (
+            converted(got, 1.0 / self._factors[agent]) if is_value and bounds.text is None else got
+        )
         place = accumulator.place if isinstance(accumulator, FirstTime) else None
         return ExpectationOutcome(got=shown, t_s=t_s, passed=passed, place=place)
 
@@ -335,10 +346,14 @@ def _fault_of(expectation: Expectation, source: RecordSource) -> str | None:
         return f"stream {stream} has no field {field_}"
     if roles and expectation.is_timed and not source.has_time(stream):
         return f"records of stream {stream} tell no time"
-    return None if expectation.meanwhile is None else _held_fault(expectation.meanwhile, source)
+    return (
+        None
+        if expectation.meanwhile is None
+        else _held_fault(expectation, expectation.meanwhile, source)
+    )
 
 
-def _held_fault(held: HeldBounds, source: RecordSource) -> str | None:
+def _held_fault(expectation: Expectation, held: HeldBounds, source: RecordSource) -> str | None:
     """Return why it is not known when a condition under `while` holds; None if it is."""
     stream, field_ = held.stream, held.field
     if not source.tables_of(stream):
@@ -347,10 +362,19 @@ def _held_fault(held: HeldBounds, source: RecordSource) -> str | None:
         return f"stream {stream} has no field {field_}"
     if not source.has_time(stream):
         return f"records of stream {stream} tell no time"
-    recorded = source.unit_of(stream, field_)
-    if held.unit and conversion(held.unit, recorded) is None:
-        return f"{stream}.{field_} is in {recorded or '1'}"
+    owners, apart = {owner_of(name) for name in expectation.agents}, source.sources_apart(stream)
+    held_by = [name for name in apart if not owners or owner_of(name) in owners]
+    for name in held_by if apart else (NOBODY,):
+        recorded = source.unit_of(stream, field_, name)
+        if held.unit and conversion(held.unit, recorded) is None:
+            return f"{stream}.{field_} is in {recorded or '1'}"
     return None
+
+
+def _has_unit(expectation: Expectation) -> bool:
+    """Tell whether bounds of an expectation are of a field's numbers, which have a unit."""
+    is_counted = expectation.statistic in OF_NUMBERS and expectation.when is None
+    return not (expectation.event or is_counted or _text_of(expectation))
 
 
 def _text_of(expectation: Expectation) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 from cosmos_cli.errors import InputError
@@ -16,12 +17,12 @@ from cosmos_cli.models.checks import Surroundings, resolve_checks
 from cosmos_cli.models.expectation import Expectation
 from cosmos_cli.models.known_streams import KnownDevice, KnownStreams
 from cosmos_cli.models.loading import ScenarioFile
-from madns_runtime.analysis.tables import RecordedRun, RecordedTable, Tables
+from madns_runtime.analysis.tables import RecordedRun, Tables
 from madns_runtime.conditions.condition import AGENT, HOST
 from madns_runtime.config import from_mapping
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.plugin.api import DeclaredStream
-from madns_runtime.recording.records import FRAMEWORK_STREAMS
+from madns_runtime.recording.records import FRAMEWORK_STREAMS, Field
 
 
 def planned_expectations(plan: Mapping[str, Any] | None) -> tuple[Expectation, ...]:
@@ -73,19 +74,18 @@ def _had_s(recorded: RecordedRun, tick_hz: float) -> float:
 
 
 def recorded_devices(tables: Tables) -> tuple[KnownDevice, ...]:
-    """Return the devices whose records a run has, by their tables."""
-    found: dict[str, dict[str, RecordedTable]] = {}
+    """Return the devices whose records a run has, by their tables, each with its own units."""
+    found: dict[tuple[str, str], dict[str, tuple[Field, ...]]] = {}
     for table in tables.values():
         if table.role == "device":
             device, _, channel = table.name.removeprefix("device_").rpartition(".")
-            found.setdefault(device, {})[channel] = table
+            for source in table.sources or ("",):
+                found.setdefault((device, source), {})[channel] = tuple(
+                    replace(each, unit=table.unit(source, each.name)) for each in table.fields
+                )
     return tuple(
-        KnownDevice(
-            name=device,
-            sources=tuple(dict.fromkeys(name for each in own.values() for name in each.sources)),
-            streams={channel: table.fields for channel, table in own.items()},
-        )
-        for device, own in found.items()
+        KnownDevice(name=device, sources=(source,) if source else (), streams=streams)
+        for (device, source), streams in found.items()
     )
 
 

@@ -11,10 +11,9 @@ import orjson
 from numpy.typing import NDArray
 
 from cosmos_cli.evidence.expectations.accumulators import Flags, Floats, Places, as_numbers
-from cosmos_cli.evidence.streams import NUMBER_KINDS
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.conditions.condition import AGENT, HOST, TIME
-from madns_runtime.recording.records import HEALTH, Field
+from madns_runtime.recording.records import HEALTH, NUMBER_KINDS, Field
 from madns_runtime.recording.stream_rules import DETAILS
 
 BATCH_RECORDS = 65_536
@@ -100,10 +99,10 @@ class RecordSource:
         found = (table for table in self.tables_of(stream) if table.role in ("machine", "device"))
         return tuple(source for table in found for source in table.sources)
 
-    def unit_of(self, stream: str, field: str) -> str:
-        """Return the unit of a field as it was recorded; empty where it was not."""
-        fields = (each for table in self.tables_of(stream) for each in table.fields)
-        return next((each.unit for each in fields if each.name == field), "")
+    def unit_of(self, stream: str, field: str, source: str) -> str:
+        """Return the unit in which a source recorded a field; empty where nobody did."""
+        tables = (table for table in self.tables_of(stream) if table.has(field))
+        return next((table.unit(source, field) for table in tables), "")
 
     def may_have(self, stream: str, field: str) -> bool:
         """Tell whether records of a stream have a field, or may: an event carries more than its stream's fields."""

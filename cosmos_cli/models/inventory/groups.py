@@ -27,10 +27,10 @@ class InventoryGroup:
     """Of the inventory itself."""
     file_variables: dict[int, dict[str, Any]] = field(default_factory=dict)
     """Of group_vars by the number of their source; they win over those of every group in the inventory itself."""
-    folders: dict[bool, Path] = field(default_factory=dict)
-    """Folder from which the files of its steps are found: for `variables` under False, `file_variables` under True."""
+    folders: dict[int | None, Path] = field(default_factory=dict)
+    """Folder from which the files of its steps are found: for `variables` under None, `file_variables` under their source's number."""
     device_folders: dict[int | None, Path] = field(default_factory=dict)
-    """Folder of the files of its devices: for `variables` under None, `file_variables` under their source's number."""
+    """Folder of the files of its devices, likewise."""
     children: dict[str, None] = field(default_factory=dict)
     parents: dict[str, None] = field(default_factory=dict)
     machines: dict[str, None] = field(default_factory=dict)

@@ -136,8 +136,8 @@ def _said_by(entity: InventoryGroup | MachineEntry) -> Variables:
     said = Variables.of({name: values[name] for name in UNITED_NAMES if name in values})
     if not said.cosmos_provision:
         return said
-    is_of_file = any(PROVISION in each for each in entity.file_variables.values())
-    folder = entity.folders.get(is_of_file, Path())
+    giving = [source for source, each in entity.file_variables.items() if PROVISION in each]
+    folder = entity.folders.get(giving[-1] if giving else None, Path())
     steps = tuple(step.with_source_in(folder) for step in said.cosmos_provision)
     return said.model_copy(update={PROVISION: steps})
 

@@ -39,7 +39,7 @@ class MachineEntry:
     """Of the inventory itself."""
     file_variables: dict[int, dict[str, Any]] = field(default_factory=dict)
     """Of host_vars by the number of their source, which win."""
-    folders: dict[bool, Path] = field(default_factory=dict)
+    folders: dict[int | None, Path] = field(default_factory=dict)
     """Folders, as of a group."""
     device_folders: dict[int | None, Path] = field(default_factory=dict)
     """Folders, as of a group."""
@@ -205,13 +205,12 @@ class Reader:
 
     def _keep(self, entity: InventoryGroup | MachineEntry, variables: Mapping[str, Any]) -> None:
         """Add variables to those of a group or a machine, and remember where the files of its steps are."""
-        is_file = self.source is not None
         kept = entity.variables
         if self.source is not None:
             kept = entity.file_variables.setdefault(self.source, {})
         kept.update(variables)
         if PROVISION in variables:
-            entity.folders[is_file] = self.folder
+            entity.folders[self.source] = self.folder
         if DEVICES in variables:
             entity.device_folders[self.source] = self.folder
 

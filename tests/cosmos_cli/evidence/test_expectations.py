@@ -36,6 +36,9 @@ class FakeTable:
     def has(self, *names):
         return set(names) <= {field.name for field in self.fields}
 
+    def unit(self, source, name):
+        return next(field.unit for field in self.fields if field.name == name)
+
     def batches(self, source, names, rows_max):
         columns = self._sources[source]
         for start in range(0, len(next(iter(columns.values()))), rows_max):

@@ -95,6 +95,22 @@ def test_what_is_declared_for_some_agents_is_remarked_on_by_their_own_declaratio
     )
 
 
+def test_a_stream_that_other_agents_parameters_declare_is_none_of_an_agent_without_them():
+    """The host's half may record of agents what their parameters declare."""
+    of_host = DeclaredStream(role="host", name="echoes", fields=(TICK,))
+    own = AgentStreams(agents=("agent-02",), streams=(*of_agents(TICK), of_host))
+    plan = {"streams": [], "agent_streams": [to_mapping(own)]}
+    scans = [
+        scan("radar", TICK),
+        scan("radar", TICK, source="agent-02"),
+        scan("echoes", TICK, role="host", source="host"),
+    ]
+
+    assert undeclared_remarks(declared_streams(plan), scans) == (
+        f"agent-01: stream radar is {NOT_DECLARED}",
+    )
+
+
 def test_remarks_are_bounded_and_the_rest_is_counted():
     remarks = told([], *(scan(f"s{n}", TICK) for n in range(REMARKS_MAX + 5)))
 

@@ -12,6 +12,7 @@ import pytest
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.launch.events import Listening
 from cosmos_cli.launch.machines import expanded
 from cosmos_cli.launch.plan import LaunchPlan, MachinePlan
 from cosmos_cli.launch.preparation import (
@@ -32,6 +33,8 @@ from cosmos_cli.launch.request import (
 from cosmos_cli.launch.restarts import Restarts
 from cosmos_cli.models.inventory import Machine, Variables
 from madns_runtime.config import Agents, Network, Recording, RunConfig
+from madns_runtime.timing.pack_split import packs_on_machine
+from madns_runtime.timing.rate import stagger
 
 CONFIG = RunConfig(
     run="0007-x", scenario="x", simulation="counter", base_directory="/here", agents=Agents(count=4)
@@ -332,18 +335,71 @@ def test_records_on_another_machine_are_synced_unless_the_scenario_says_how() ->
     assert config_at(own, there).recording.sync_interval_s == 0
 
 
-def test_packs_of_a_run_are_numbered_through_all_its_machines():
-    """24 agents on three machines, three per process, which is three packs on each."""
-    agents = Agents(count=24, per_process=3)
+def request_of(agents: Agents, machines: dict[str, tuple[str, ...]]) -> LaunchRequest:
+    config = dataclasses.replace(CONFIG, agents=agents)
+    return LaunchRequest(config=config, directory=Path("/runs/0007-x"), machines=machines)
+
+
+@pytest.mark.parametrize(
+    ("count", "per_process"), [(96, 48), (93, 47), (1000, 125), (24, 12), (50, 47)]
+)
+def test_packs_are_spread_over_the_period(count: int, per_process: int) -> None:
+    agents = Agents(count=count, tick_hz=10.0, per_process=per_process)
     names = agents.resolved_names()
-    machines = {"pi01": names[::3], "pi02": names[1::3], "pi03": names[2::3]}
+    packs = packs_on_machine(names, per_process)
 
-    def numbers(config: RunConfig, machines: dict[str, tuple[str, ...]]) -> list[Any]:
-        request = LaunchRequest(config=config, directory=Path("/runs/0007-x"), machines=machines)
-        return [request.packs_elsewhere(name) for name in machines]
+    phases_s = request_of(agents, {"pi01": names}).phases_s()
 
-    shared = dataclasses.replace(CONFIG, agents=agents)
-    assert numbers(shared, machines) == [(0, 6), (3, 3), (6, 0)]
-    assert numbers(shared, {"pi01": names}) == [None]
-    by_themselves = dataclasses.replace(agents, per_process=1)
-    assert numbers(dataclasses.replace(CONFIG, agents=by_themselves), machines) == [None] * 3
+    assert [len({phases_s[name] for name in pack}) for pack in packs] == [1] * len(packs)
+    assert sorted(phases_s[pack[0]] for pack in packs) == pytest.approx(
+        [0.1 * number / len(packs) for number in range(len(packs))]
+    )
+
+
+def test_packs_of_all_machines_are_spread_over_the_period() -> None:
+    """24 agents on two machines, three per process, which is four packs on each."""
+    agents = Agents(count=24, tick_hz=10.0, per_process=3)
+    names = agents.resolved_names()
+    machines = {"pi01": names[::2], "pi02": names[1::2]}
+
+    phases_s = request_of(agents, machines).phases_s()
+
+    assert sorted(phases_s.values()) == pytest.approx(
+        [0.1 * number / 8 for number in range(8) for _ in range(3)]
+    )
+    assert phases_s[names[0]] == phases_s[names[4]] != phases_s[names[6]]
+
+
+def test_agents_by_themselves_divide_the_period_by_their_numbers() -> None:
+    agents = Agents(count=24, tick_hz=100.0)
+    names = agents.resolved_names()
+    machines = {"pi01": names[::2], "pi02": names[1::2]}
+
+    phases_s = request_of(agents, machines).phases_s()
+
+    assert sorted(phases_s.values()) == pytest.approx([number / 24 / 100 for number in range(24)])
+    assert [phases_s[name] for name in names] == [stagger(i, 24, 100.0) for i in range(24)]
+
+
+def test_aligned_packs_share_the_beginning_of_the_period() -> None:
+    agents = Agents(count=24, tick_hz=100.0, per_process=24, phase="aligned")
+
+    phases_s = request_of(agents, {"pi01": agents.resolved_names()}).phases_s()
+
+    assert set(phases_s.values()) == {0.0}
+
+
+@pytest.mark.parametrize("there", [1, 2])
+def test_agents_of_a_machine_that_has_returned_have_the_phases_they_had(there: int) -> None:
+    """Those that may not be started again, or left the run, are missing among them."""
+    agents = Agents(count=48, tick_hz=1.0, per_process=8)
+    names = agents.resolved_names()
+    machines = {"pi01": names[:24], "pi02": names[24:]} if there == 2 else {"pi01": names}
+    request = request_of(agents, machines)
+    left = (*names[3:12], *names[17:24])
+
+    before = request.agent_launch("pi01", machines["pi01"], Listening("127.0.0.1", 1))
+    after = request.agent_launch("pi01", left, Listening("127.0.0.1", 1))
+
+    assert after["phases_s"] == {name: before["phases_s"][name] for name in left}
+    assert request.host_launch()["phases_s"].items() >= before["phases_s"].items()

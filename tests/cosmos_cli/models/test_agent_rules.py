@@ -117,7 +117,9 @@ def test_mappings_of_a_rule_merge_and_lists_replace(load):
 def test_what_a_rule_makes_agents_declare_and_take_is_theirs(load):
     found = load(OWN + "  - {agents: [agent-3], parameters: {port: 7, extra_stream: more}}\n")
 
-    assert [stream.name for stream in found.streams] == ["drive", "more"]
+    assert [stream.name for stream in found.streams] == ["drive"]
+    (own,) = found.agent_streams
+    assert (own.agents, [each.name for each in own.streams]) == (("agent-3",), ["drive", "more"])
     assert {use.agent: use.place for use in found.place_uses} == {
         "agent-1": "port 0",
         "agent-2": "port 0",

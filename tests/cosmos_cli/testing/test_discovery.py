@@ -2,6 +2,7 @@
 
 import errno
 import os
+import time
 
 import pytest
 from harness.nested_folders import nested_folders
@@ -111,6 +112,43 @@ def test_files_of_other_programs_are_left_out(folder, content):
     assert found.faults == []
     assert folder / "other.yaml" in found.others
     assert str(folder / "other.yaml") in chosen(found).left_out
+
+
+def test_a_file_of_very_many_blank_lines_is_looked_through_at_once(folder):
+    (folder / "other.yaml").write_text("{ a: [\n" + "\n" * 40_000 + "x")
+    began_s = time.process_time()
+
+    found = find_scenarios([folder])
+
+    assert folder / "other.yaml" in found.others
+    # It took more than a minute while each line was looked at from each one before it.
+    assert time.process_time() - began_s < 10
+
+
+BASE = "name: base\nagents: {count: 2, tick_hz: 10}\ntime: {duration_s: 5, mode: lockstep}\n"
+
+
+def test_a_named_base_without_a_simulation_is_no_test_of_a_folder(folder):
+    (folder / "base.yaml").write_text(BASE)
+    (folder / "middle.yaml").write_text("extends: base.yaml\nname: middle\n")
+    (folder / "zeta.yaml").write_text("extends: middle.yaml\nname: zeta\nsimulation: counter\n")
+
+    found = find_scenarios([folder])
+
+    assert len(chosen(found).cases) == 4
+    assert {outline.name for outline in found.outlines} == {"alpha", "beta", "gamma", "zeta"}
+    assert {folder / "base.yaml", folder / "middle.yaml"} <= set(found.others)
+
+
+@pytest.mark.parametrize("is_extended", [True, False])
+def test_a_base_that_is_named_or_of_nothing_that_runs_is_at_fault(folder, is_extended):
+    (folder / "base.yaml").write_text(BASE)
+    if is_extended:
+        (folder / "zeta.yaml").write_text("extends: base.yaml\nsimulation: counter\n")
+    paths = [folder, folder / "base.yaml"] if is_extended else [folder]
+
+    with pytest.raises(InputError, match="simulation"):
+        chosen(find_scenarios(paths))
 
 
 def test_links_to_folders_are_told_as_left_out(folder):

@@ -8,7 +8,7 @@ import numpy as np
 
 from madns_runtime.analysis.distribution import Distribution
 from madns_runtime.analysis.tables import RecordedRun, RecordedTable
-from madns_runtime.plain_values import mapping_at
+from madns_runtime.plain_values import is_real, mapping_at
 
 ROUND_TRIP = "round_trip_us"
 US_TO_MS = 1e-3
@@ -76,6 +76,9 @@ def _counts(run: RecordedRun) -> dict[str, dict[str, Any]]:
             done, missed = _count(ticks, agent)
             # Those that no tick followed are told by the records of causes alone.
             told = 0 if late is None or agent not in late.sources else _count(late, agent)[1]
+            # Those of an agent that was gone are told by nobody, and run.json alone counts them.
+            gone = mapping_at(run.document, "timing", "causes_by_agent", agent).get("absent")
+            told += int(gone) if is_real(gone) else 0
             found[agent] |= {"ticks": done, "missed": max(missed, told)}
     return found
 
