@@ -25,6 +25,8 @@ FIGURES = ("p50", "p99", "p999", "max")
 Policy = Literal["normal", "fifo"]
 POLICIES: tuple[Policy, ...] = ("normal", "fifo")
 POLICY_WORDS: Mapping[Policy, str] = {"normal": "normal", "fifo": "SCHED_FIFO"}
+KERNEL_WORDS: Mapping[bool | None, str] = {True: "PREEMPT_RT", False: "ordinary", None: ""}
+"""Words for whether a machine's kernel is PREEMPT_RT; None where that is not known."""
 COLUMNS = (
     Column("machine"),
     Column("kernel"),
@@ -128,7 +130,7 @@ def _not_measured(others: Sequence[Told]) -> Told:
         **dict.fromkeys(("due", "missed", "sent", "answered"), 0),
         **dict.fromkeys(("lateness_us", "round_trip_us")),
         "error": f"{NO_ADDRESS}: {NO_ADDRESS_CURE}",
-        "is_preempt_rt": any(told["is_preempt_rt"] for told in others),
+        "is_preempt_rt": others[0]["is_preempt_rt"] if others else None,
     }
 
 
@@ -140,7 +142,7 @@ def rows_of(machine: str, measured: Sequence[Told]) -> Iterator[tuple[str, ...]]
         words = f"{policy}: {told['refusal'] or told['error']}" if late is None else policy
         yield (
             machine,
-            "PREEMPT_RT" if told["is_preempt_rt"] else "",
+            KERNEL_WORDS[told["is_preempt_rt"]],
             told["way"],
             f"{told['rate_hz']:g}",
             words,

@@ -39,13 +39,17 @@ def descriptor_of(told: Any) -> int | None:
     Return the descriptor that `fileno` gave.
 
     Raises:
-        PluginError: It is none, or that of a regular file, which is readable at any time.
+        PluginError: It is none, not open, or that of a regular file, which is readable at any time.
     """
     if told is None:
         return None
-    if not isinstance(told, int) or told < 0:
+    if not isinstance(told, int) or not 0 <= told < 1 << 31:
         raise PluginError(f"expected an open descriptor (a number), or None; got {told!r:.80}")
-    if stat.S_ISREG(os.fstat(told).st_mode):
+    try:
+        mode = os.fstat(told).st_mode
+    except OSError as error:
+        raise PluginError(f"expected an open descriptor, got {told}: {error.strerror}") from None
+    if stat.S_ISREG(mode):
         raise PluginError(
             "expected a descriptor that is readable when there is something new, got a regular file's, which always is:"
             " return None, to be read at the device's rate"

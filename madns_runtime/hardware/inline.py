@@ -18,15 +18,13 @@ from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
-from madns_runtime.hardware.simulated import STANDS_STILL, next_of
+from madns_runtime.hardware.simulated import TimeProgress, next_of
 from madns_runtime.hardware.status import StatusAccount, limits_of
 from madns_runtime.plugin.context import describe_exception
 
 RECORDS_TIMEOUT_S: Final = 10.0
 ROUNDING: Final = 1e-9
 """Of a time in periods: 0.3 s are three of 0.1 s."""
-SAMPLES_MAX: Final = 1_000_000
-"""In one tick, outputs with them: more means that a driver never lets time go on."""
 
 
 class InlineDevice:
@@ -64,6 +62,7 @@ class InlineDevice:
         self._account = StatusAccount()
         self._rate_hz = launch.rate_hz
         self._count = 0
+        self._progress = TimeProgress()
         self._launch = launch
         self._why = ""
         """Words for what its driver raised at the end, or why it was lost before."""
@@ -113,15 +112,10 @@ class InlineDevice:
     def _pass_over(self, t_s: float) -> None:
         """Leave out what it had to tell before it was opened: a recording goes on, and does not begin anew."""
         self._count = math.ceil(t_s * self._rate_hz - ROUNDING)
-        for _ in range(SAMPLES_MAX):
-            next_s = self._call("next_s", next_of, self._device)
-            if next_s is None or next_s >= t_s:
-                return
+        while (next_s := self._call("next_s", next_of, self._device)) is not None and next_s < t_s:
+            self._call("next_s", self._progress.note, next_s)
             sample = self._call("sample_at", self._device.sample_at, max(next_s, 0.0))
             self._intake.count("passed_while_closed", int(sample is not None))
-        raise PluginError(
-            f"device {self.name}: {SAMPLES_MAX} samples before {t_s:g} s, and no end: {STANDS_STILL}"
-        )
 
     def advance(self, t_s: float) -> None:
         """
@@ -136,7 +130,7 @@ class InlineDevice:
         if failure is not None:
             raise failure
         self._hear()
-        for _ in range(SAMPLES_MAX):
+        while True:
             next_s = self._call("next_s", next_of, self._device)
             due_s = self._count / self._rate_hz if next_s is None else max(next_s, 0.0)
             output_s = min(self._outputs.next_write_s(), self._outputs.next_point_s())
@@ -146,6 +140,8 @@ class InlineDevice:
                 self._put_out_due(max(output_s, self._handed_s))
                 continue
             self._count += 1
+            if next_s is not None:
+                self._call("next_s", self._progress.note, next_s)
             sample = self._call("sample_at", self._device.sample_at, due_s)
             if sample is None:
                 continue
@@ -154,10 +150,6 @@ class InlineDevice:
                 continue
             handed_s = due_s if sample.handed_s is None else sample.handed_s
             self._intake.take(sample, handed_s, ahead_s=1.0 / self._rate_hz)
-        else:
-            raise PluginError(
-                f"device {self.name}: {SAMPLES_MAX} samples and outputs by {t_s:g} s, and no end: {STANDS_STILL}"
-            )
         self._intake.tell_held(t_s)
         self._account.observe(self._page.status(self._limits, t_s), t_s)
         self._handed_s = t_s

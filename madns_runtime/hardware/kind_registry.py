@@ -79,6 +79,9 @@ def resolve_kind(spec: str, base_directory: Path) -> DeviceKind:
         )
     if wrong := kind_faults(kind):
         raise PluginError(f"{told_place(where, found)}: {'; '.join(wrong)}")
+    driver = found if isinstance(found, type) else kind.device
+    if not isinstance(driver, str) and (fault := _class_fault(kind, driver)):
+        raise PluginError(f"{told_place(where, found)}: {fault}")
     if isinstance(found, type):
         return replace(kind, device=found)
     if isinstance(kind.device, str) and kind.device.startswith(":"):
@@ -145,15 +148,28 @@ def _make(kind: DeviceKind, parameters: Any, base_directory: Path) -> Device:
         MachineError: A library that it imports is not installed.
     """
     driver: Any = kind.device
+    where = kind.name
     if isinstance(driver, str):
         try:
             _, driver = load_object(driver, base_directory)
+            where = f"{kind.name}: {told_place(str(kind.device), driver)}"
         except PluginError as error:
             raise _library_missing(kind, error.__cause__) or error from None
+    if fault := _class_fault(kind, driver):
+        raise PluginError(f"{where}: {fault}")
+    device: Device = driver(parameters)
+    return device
+
+
+def _class_fault(kind: DeviceKind, driver: Any) -> str:
+    """Return what is wrong with what a kind gives as its driver's class; empty if nothing is."""
     wanted = SimulatedDevice if kind.follows_simulated_time else Device
-    if not (isinstance(driver, type) and issubclass(driver, wanted)):
-        raise PluginError(f"{kind.name}: {kind.device}: expected a subclass of {wanted.__name__}")
-    return driver(parameters)
+    if isinstance(driver, type) and issubclass(driver, wanted):
+        return ""
+    got = getattr(driver, "__qualname__", f"{driver!r:.80}")
+    if kind.follows_simulated_time:
+        return f"follows_simulated_time needs a subclass of SimulatedDevice (sample_at), got {got}"
+    return f"expected a subclass of Device, got {got}"
 
 
 def _library_missing(kind: DeviceKind, cause: BaseException | None) -> MachineError | None:

@@ -95,9 +95,10 @@ class DeviceRunner:
             return
         header = self._header
         header[page.ACTIVE_S] = monotonic()
-        self._is_own = False
+        method, self._is_own = "__init__", False
         try:
             self._device = device = self._seat.make()
+            method = "open"
             device.may_move, device.place = self._launch.may_move, self._launch.place
             self._intake.serve(device)
             identity = driver_answers.identity_of(device.open())
@@ -105,11 +106,12 @@ class DeviceRunner:
             self._seat.check_identity(identity)
             self._is_own = True
             self._intake.count("passed_while_closed", pass_over(device, self._records.time, header))
+            method = "fileno"
             if (fd := driver_answers.descriptor_of(device.fileno())) is not None:
                 intake, readable = self._intake, self._readable
                 self._descriptor = DriverDescriptor(fd, self._reactor, readable, intake.event)
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
-            self._fail("open" if self._device is not None else "__init__", error)
+            self._fail(method, error)
             return
         header[page.OPENED_S] = header[page.ACTIVE_S] = now_s = monotonic()
         header[page.STATE] = page.OPEN
@@ -368,12 +370,10 @@ class DeviceRunner:
         return ""
 
     def _tell_state(self) -> None:
-        now_s = monotonic()
+        now_s, header = monotonic(), self._header
         details: Mapping[str, Any] = {}
-        header = self._header
-        heard_s = max(header[page.ARRIVED_S], self._intake.withheld_s)
-        silent_s = now_s - max(heard_s, header[page.OPENED_S])
-        if self._device is not None and silent_s > self._silent_s:
+        heard_s = max(header[page.ARRIVED_S], header[page.OPENED_S], self._intake.withheld_s)
+        if self._device is not None and now_s - heard_s > self._silent_s:
             self._fail("read", MachineError(f"no sample within {self._silent_s:g} s"))
         if self._device is not None:
             try:

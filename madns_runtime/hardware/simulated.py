@@ -13,8 +13,10 @@ from madns_runtime.hardware import page
 from madns_runtime.hardware.contract import Device, Sample, SimulatedDevice
 from madns_runtime.hardware.records import SimulatedTime
 
-PASSED_AT_ONCE_MAX: Final = 10_000
-"""Samples of one simulated time."""
+AT_ONCE_S: Final = 0.01
+"""Simulated time within which samples count as of one time, s: a driver that goes on by nanoseconds comes to no end either."""
+AT_ONCE_MAX: Final = 10_000
+"""Samples of one simulated time, in real time and in lockstep; a tick's watchdog waits for longer than they take."""
 STANDS_STILL: Final = (
     "next_s() should tell of a later time once sample_at() has given what there was"
 )
@@ -41,6 +43,31 @@ def next_of(device: SimulatedDevice) -> float | None:
     return next_s
 
 
+class TimeProgress:
+    """Sees to it that the times told by one device's `next_s` go on."""
+
+    def __init__(self) -> None:
+        self._since_s, self._count = -math.inf, 0
+
+    def note(self, next_s: float) -> None:
+        """
+        Take note of one sample.
+
+        Args:
+            next_s: The time told of it, simulated, s.
+
+        Raises:
+            PluginError: The driver lets time stand still.
+        """
+        if next_s > self._since_s + AT_ONCE_S:
+            self._since_s, self._count = next_s, 0
+        self._count += 1
+        if self._count > AT_ONCE_MAX:
+            raise PluginError(
+                f"more than {AT_ONCE_MAX} samples at {self._since_s:g} s: {STANDS_STILL}"
+            )
+
+
 def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) -> int:
     """
     Leave out what a device had to tell while it was not open: a recording goes on, and does not begin anew.
@@ -58,16 +85,10 @@ def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) ->
     """
     if not isinstance(device, SimulatedDevice) or not time.is_known:
         return 0
-    t_s, passed = time.at(monotonic()), 0
-    latest_s, still = -math.inf, 0
+    t_s, passed, progress = time.at(monotonic()), 0, TimeProgress()
     while (next_s := next_of(device)) is not None and next_s <= t_s:
         header[page.ACTIVE_S] = monotonic()
-        still = 0 if next_s > latest_s else still + 1
-        latest_s = max(latest_s, next_s)
-        if still > PASSED_AT_ONCE_MAX:
-            raise PluginError(
-                f"more than {PASSED_AT_ONCE_MAX} samples at {next_s:g} s: {STANDS_STILL}"
-            )
+        progress.note(next_s)
         passed += device.sample_at(t_s) is not None
     return passed
 

@@ -11,6 +11,8 @@ from madns_runtime.hardware.contract import Channel
 
 EDGE_ROUNDING: Final = 1e-9
 """Share of a digit, and of a limit, that arithmetic may cost."""
+NO_NUMBERS: Final = frozenset("USOcmM")
+"""Kinds of numpy's elements that float() takes, by numpy's code of one letter: text, bytes, objects, complex, times."""
 
 
 def to_numbers(channel: Channel, value: Any) -> tuple[float, ...]:
@@ -21,7 +23,7 @@ def to_numbers(channel: Channel, value: Any) -> tuple[float, ...]:
         PluginError: It has another shape, or holds what is no number.
     """
     try:
-        numbers = (float(value),) if not channel.shape else tuple(map(float, _flat(value)))
+        numbers = tuple(map(_number, _flat(value) if channel.shape else (value,)))
     except (TypeError, ValueError, OverflowError, RecursionError):
         raise PluginError(
             f"{channel.name}: expected {_wanted(channel)}, got {value!r:.80}"
@@ -128,11 +130,25 @@ def from_numbers(channel: Channel, numbers: Sequence[float]) -> Any:
     return tuple(numbers) if channel.shape else numbers[0]
 
 
+def _number(value: Any) -> float:
+    """
+    Return one element as a number.
+
+    Raises:
+        TypeError: It is text or bytes, which float() would read, or else no number.
+        ValueError, OverflowError: It has none that fits.
+    """
+    kind = getattr(getattr(value, "dtype", None), "kind", None)
+    if isinstance(value, str | bytes | bytearray | memoryview) or kind in NO_NUMBERS:
+        raise TypeError("expected a number")
+    return float(value)
+
+
 def _flat(value: Any) -> Any:
     """Return the elements of nested sequences and arrays, row by row."""
     if hasattr(value, "ravel"):
         return value.ravel()
-    if isinstance(value, str | bytes | Mapping | Set):
+    if isinstance(value, str | bytes | bytearray | Mapping | Set):
         raise TypeError("expected numbers in an order")
     if isinstance(value, Sequence):
         return [element for row in value for element in (_flat(row) if _is_row(row) else (row,))]

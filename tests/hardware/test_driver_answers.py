@@ -81,7 +81,10 @@ def settled(folder):
     ("wrong", "told"),
     [
         ({"identity": "5"}, "Probe.open: expected a text as the device's identity"),
-        ({"fileno": "-1"}, "expected an open descriptor (a number), or None; got -1"),
+        ({"fileno": "-1"}, "Probe.fileno: expected an open descriptor (a number), or None; got -1"),
+        ({"fileno": "1 << 40"}, "expected an open descriptor (a number), or None; got 1099511627776"),
+        ({"fileno": "900"}, "Probe.fileno: expected an open descriptor, got 900: Bad file descriptor"),
+        ({"fileno": "{}['port']"}, "Probe.fileno raised KeyError: 'port' (probe.py:"),
         ({"fileno": "self.file"}, "expected an open descriptor (a number), or None; got <_io"),
         ({"fileno": "self.file.fileno()"}, "got a regular file's, which always is: return None"),
         ({"health": "[1]"}, "expected a mapping of what is known of its state, got [1]"),

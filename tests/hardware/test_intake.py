@@ -1,5 +1,9 @@
 """What drivers read, before anybody sees it: shapes, numbers that are none, what becomes the newest sample."""
 
+from decimal import Decimal
+from fractions import Fraction
+
+import numpy as np
 import pytest
 
 from madns_runtime.errors import ConfigurationError, PluginError
@@ -7,7 +11,7 @@ from madns_runtime.hardware import page
 from madns_runtime.hardware.contract import Channel, Sample
 from madns_runtime.hardware.intake import Intake
 from madns_runtime.hardware.page import DevicePage
-from madns_runtime.hardware.values import to_numbers
+from madns_runtime.hardware.values import to_numbers, to_output
 
 NAN = float("nan")
 FIELD = Channel(name="field", unit="T", shape=(3,))
@@ -38,11 +42,44 @@ def make_intake():
 
 @pytest.mark.parametrize(
     "value",
-    ["abc", b"abc", {1.0, 2.0, 3.0}, {0: 1.0}, None, 1.0, ["a", 1, 2], (10**400, 0, 0), ITSELF],
+    [
+        *("abc", b"abc", bytearray(b"abc"), {1.0, 2.0, 3.0}, {0: 1.0}, None, 1.0),
+        *(["a", 1, 2], ["1", "2", "3"], [b"1", 2, 3], (10**400, 0, 0), ITSELF),
+        *(np.array(["1", "2", "3"], dtype=kind) for kind in ("U", "S", "O")),
+        np.array([1j, 2.0, 3.0]),
+    ],
 )
 def test_what_is_no_vector_is_refused_by_its_channel(value):
     with pytest.raises(PluginError, match="field: expected 3 numbers, got "):
         to_numbers(FIELD, value)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *("1.0", " 1_0 ", "nan", b"2", bytearray(b"2"), memoryview(b"2"), None, 1j, [1.0]),
+        *(
+            np.array("1"),
+            np.array(b"1"),
+            np.array("1", dtype=object),
+            np.str_("1"),
+            np.complex128(1),
+        ),
+    ],
+)
+def test_what_is_no_number_is_refused_by_its_channel_though_it_spells_one(value):
+    with pytest.raises(PluginError, match="level: expected a number, got "):
+        to_numbers(LEVEL, value)
+    with pytest.raises(PluginError, match="level: expected a number, got "):
+        to_output(LEVEL, value)
+
+
+@pytest.mark.parametrize(
+    "value", [2, 2.0, np.float32(2), np.int64(2), np.array(2.0), Fraction(2), Decimal(2)]
+)
+def test_numbers_of_any_type_are_numbers(value):
+    assert to_numbers(LEVEL, value) == (2.0,)
+    assert to_numbers(FIELD, [value] * 3) == (2.0, 2.0, 2.0)
 
 
 def test_nested_rows_become_numbers_row_by_row():

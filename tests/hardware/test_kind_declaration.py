@@ -66,6 +66,10 @@ hardware:
             ONE[:-3] + ", direction='out', safe=float('nan')),)",
             "expected a finite safe value, got nan",
         ),
+        (
+            ONE + ", follows_simulated_time=True",
+            r"\./meter.py:Meter: follows_simulated_time needs a subclass of SimulatedDevice \(sample_at\), got Meter",
+        ),
         (ONE + ", rate_hz=0", "rate_hz: expected a number above 0, got 0"),
         (ONE + ", rate_hz=5000.0", r"rate_hz: expected at most rate_hz_max \(1000\), got 5000"),
         (
@@ -91,6 +95,23 @@ def test_it_is_refused_on_the_machine_and_at_its_line_in_a_scenario(tmp_path, de
         load_scenario(tmp_path / "meter.yaml", ())
     (fault,) = caught.value.faults
     assert (fault.line, fault.path) == (7, "hardware.devices[0].kind")
+
+
+def test_a_driver_that_is_no_device_is_told_as_its_file_calls_it(tmp_path):
+    text = DRIVER.replace("DECLARED", f'summary="s", {ONE}, follows_simulated_time=True')
+    text += "\nknown = dataclasses.replace(Meter.kind, device=Meter)"
+    text += "\nnamed = dataclasses.replace(Meter.kind, device=':Meter')\n"
+    (tmp_path / "meter.py").write_text(f"import dataclasses\n{text}")
+
+    with pytest.raises(PluginError, match=r"meter.py:known: follows_simulated_time needs a "):
+        prepare("./meter.py:known", {}, tmp_path)
+    program = prepare(
+        "./meter.py:named", {}, tmp_path
+    )  # its class is imported by its process alone
+    with pytest.raises(
+        PluginError, match=r"^meter: \S+meter.py:\d+: Meter: follows_simulated_time "
+    ):
+        program.make()
 
 
 def test_lists_and_whole_numbers_are_taken_for_what_they_mean(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import signal
@@ -33,7 +34,7 @@ CONFIG = RunConfig(
 class InlineBench:
     """A `null` device in lockstep, and the agent that uses it."""
 
-    def __init__(self, folder, **launch):
+    def __init__(self, folder, *, is_open=True, **launch):
         program = prepare("null", {"outputs": ["coil"], "low": -1.0, "high": 1.0}, folder)
         recorder = Recorder(RecordFiles(folder, run="0001-r", source="a/null"), CONFIG.recording)
         records = DeviceRecords(
@@ -47,7 +48,8 @@ class InlineBench:
             name="null", place="a", kind="null", base_directory="", rate_hz=10, **settings
         )
         self.device = InlineDevice(told, program, records, now_s=lambda: self.t_s)
-        self.device.open()
+        if is_open:
+            self.device.open()
         self.port = self.device.port
 
     def advance(self, t_s):
@@ -75,15 +77,32 @@ def test_in_lockstep_each_point_is_put_out_at_its_due_time(tmp_path):
     assert told["lateness_us"] == {"p50": 0, "p99": 0, "max": 0}
 
 
-def test_in_lockstep_a_driver_that_lets_time_stand_still_is_told_so(tmp_path, monkeypatch):
+@pytest.mark.parametrize("step_s", [0.0, 1e-9])
+def test_in_lockstep_a_driver_that_lets_time_stand_still_is_told_so(tmp_path, monkeypatch, step_s):
+    monkeypatch.setattr("madns_runtime.hardware.simulated.AT_ONCE_MAX", 20)
     bench = InlineBench(tmp_path)
-    monkeypatch.setattr("madns_runtime.hardware.inline.SAMPLES_MAX", 50)
     bench.advance(4.8)  # 49 samples, one per 0.1 s
-    monkeypatch.setattr("madns_runtime.hardware.drivers.null.NullDevice.next_s", lambda self: 4.8)
+    told_s = (4.8 + step_s * number for number in itertools.count())
+    monkeypatch.setattr(
+        "madns_runtime.hardware.drivers.null.NullDevice.next_s", lambda self: next(told_s)
+    )
     with pytest.raises(
-        PluginError, match=r"null: 50 samples and outputs by 4.9 s, and no end: next_s"
+        PluginError, match=r"device null: NullDevice.next_s.* more than 20 samples at 4.8 s: next_s"
     ):
         bench.advance(4.9)
+
+
+def test_in_lockstep_a_device_opened_late_passes_over_any_number_of_samples(tmp_path, monkeypatch):
+    monkeypatch.setattr("madns_runtime.hardware.simulated.AT_ONCE_MAX", 20)
+    bench = InlineBench(tmp_path, is_open=False)
+    told_s = itertools.count(0.0, 0.1)
+    monkeypatch.setattr(
+        "madns_runtime.hardware.drivers.null.NullDevice.next_s", lambda self: next(told_s)
+    )
+    bench.t_s = 100.0
+    bench.device.open()
+
+    assert bench.device.close()["passed_while_closed"] >= 999
 
 
 def test_in_lockstep_what_came_too_late_is_put_out_once_and_counted(tmp_path):

@@ -40,7 +40,7 @@ def passed_over(tape):
 
 @pytest.fixture(autouse=True)
 def few_at_once(monkeypatch):
-    monkeypatch.setattr(simulated, "PASSED_AT_ONCE_MAX", COUNT_MAX)
+    monkeypatch.setattr(simulated, "AT_ONCE_MAX", COUNT_MAX)
 
 
 def test_what_a_device_had_to_tell_while_it_was_closed_is_passed_over_however_much_it_is():
@@ -55,6 +55,11 @@ def test_what_a_device_had_to_tell_while_it_was_closed_is_passed_over_however_mu
 def test_a_driver_that_lets_time_stand_still_is_told_so():
     with pytest.raises(PluginError, match=r"more than 20 samples at 5 s: next_s\(\) should tell"):
         passed_over(Tape([5.0], stands_still=True))
+
+
+def test_a_driver_that_lets_time_go_on_by_nanoseconds_is_told_so_too():
+    with pytest.raises(PluginError, match=r"more than 20 samples at 5 s: next_s\(\) should tell"):
+        passed_over(Tape([5.0 + 1e-9 * number for number in range(COUNT_MAX + 1)]))
 
 
 @pytest.mark.parametrize("told", [math.nan, "soon", [1.0]])

@@ -76,7 +76,7 @@ def a_timeline(
         is_in=lambda state: True,
     )
     core: Any = SimpleNamespace(
-        launch=SimpleNamespace(config=config),
+        launch=SimpleNamespace(config=config, phases_s={}),
         port=port,
         half=SimpleNamespace(call=None),
         guard=lambda call, *given: call(*given),

@@ -107,6 +107,17 @@ def test_refused_fifo_is_told_in_the_table():
     )
 
 
+@pytest.mark.parametrize(
+    ("is_preempt_rt", "kernel"), [(True, "PREEMPT_RT"), (False, "ordinary"), (None, "")]
+)
+def test_floor_says_what_kernel_it_was_measured_on(is_preempt_rt, kernel):
+    told = {"refusal": None, "error": None, "is_preempt_rt": is_preempt_rt, "missed": 0}
+    told |= {"lateness_us": None, "round_trip_us": None, "sent": 0, "answered": 0}
+    (row,) = floor.rows_of("pi01", [{"way": "loopback", "rate_hz": 1e3, "policy": "fifo", **told}])
+
+    assert row[1] == kernel
+
+
 def test_floor_leaves_out_the_network_of_a_machine_whose_way_here_is_not_known(monkeypatch):
     monkeypatch.setattr(LocalConnection, "own_address", "")  # as through a ProxyCommand
     target = Target(name="pi01", address="pi01", connection="local", python=sys.executable)
