@@ -9,7 +9,6 @@ from typing import Any
 from cosmos_cli.collect.finished_run import (
     collected_document,
     is_as_listed,
-    listed_files,
     refuse_foreign_tables,
 )
 from cosmos_cli.collect.previous_manifest import Earlier, is_there
@@ -113,8 +112,7 @@ def open_side(run: RunDirectory, given: str) -> Side:
 
 def _changed_since(run: RunDirectory) -> Iterator[str]:
     """Tell of files that are gone or changed; of streams by their length alone, as they are hashed when they are read."""
-    own = {name: entry for name, entry in listed_files(run).items() if name == run.run_json.name}
-    for name, entry in {**Earlier.read(run).entries, **own}.items():
+    for name, entry in Earlier.read(run).entries.items():
         if name.startswith(f"{run.tables.name}/"):
             continue  # can be made anew
         path, was = run.path / name, entry.get("bytes")
