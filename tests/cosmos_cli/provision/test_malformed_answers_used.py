@@ -80,6 +80,7 @@ def told_facts():
         "services": dict.fromkeys(asked["services"], {"enabled": "disabled", "active": "inactive"}),
         "packages": dict.fromkeys(asked["packages"]),
         "conditions": dict.fromkeys(asked["conditions"], False),
+        "stale_units": [],
     }
 
 
