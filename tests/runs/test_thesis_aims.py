@@ -45,6 +45,9 @@ class SameForAll:
     def rows(self):
         return len(self.sources) * len(self._columns["t_s"])
 
+    def unit(self, source, name):
+        return next(field.unit for field in self.fields if field.name == name)
+
     def has(self, *names):
         return set(names) <= {field.name for field in self.fields}
 
