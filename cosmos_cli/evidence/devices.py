@@ -41,6 +41,7 @@ _TOLD_APART = frozenset(
         "frozen",
         "unsafe",
         "silent_inputs",
+        "least_stale_age_s",
         "report",
     )
 )
@@ -125,6 +126,7 @@ def device_remarks(
     return (
         *device_loss_remarks(agents, devices),
         *silent_input_remarks(devices),
+        *stale_sample_remarks(devices),
         *refusal_remarks(devices),
     )
 
@@ -166,6 +168,19 @@ def silent_input_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str,
     ]
     rest = len(found) - LOSSES_TOLD_MAX
     more = [f"{counted(rest, 'more device')} with an input of which no value ever came"]
+    return (*found[:LOSSES_TOLD_MAX], *(more if rest > 0 else ()))
+
+
+def stale_sample_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return a remark per device of which each sample was stale when it came; at most LOSSES_TOLD_MAX, then how many more."""
+    found = [
+        f"device {device}: {counted(account['samples'], 'sample')} came, the youngest {age_s:.6g} s old when it came:"
+        " is taken_s time.monotonic() at the read?"
+        for device, account in devices.items()
+        if account.get("samples") and (age_s := account.get("least_stale_age_s"))
+    ]
+    rest = len(found) - LOSSES_TOLD_MAX
+    more = [f"{counted(rest, 'more device')} of which each sample was stale when it came"]
     return (*found[:LOSSES_TOLD_MAX], *(more if rest > 0 else ()))
 
 
@@ -276,6 +291,7 @@ def _joined(told: Sequence[Mapping[str, Any]], incarnations: int) -> dict[str, A
         "why": clean_line(next((str(e["why"]) for e in reversed(flat) if e.get("why")), "")),
         "counts": _counts(flat),
         **({"silent_inputs": silent} if (silent := _silent_inputs(flat)) else {}),
+        **({"least_stale_age_s": age_s} if (age_s := _least_stale_age_s(flat)) else {}),
         **({"stimulus": stimulus} if (stimulus := _stimulus(flat)) else {}),
     }
 
@@ -304,6 +320,13 @@ def _silent_inputs(told: Sequence[Mapping[str, Any]]) -> list[str]:
     lists = [each.get("silent_inputs") for each in told]
     sets = [{str(name) for name in names} if isinstance(names, list) else set() for names in lists]
     return sorted(map(clean_line, set.intersection(*sets)))
+
+
+def _least_stale_age_s(told: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the least age of a sample as it came, s; None if in any incarnation one was fresh, or none came."""
+    ages = [each.get("least_stale_age_s") for each in told]
+    numbers = [float(age) for age in ages if is_number(age)]
+    return min(numbers) if len(numbers) == len(ages) else None
 
 
 def _sum(told: Iterable[Mapping[str, Any]], key: str) -> int | None:

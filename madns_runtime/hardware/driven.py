@@ -15,7 +15,7 @@ from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Device
 from madns_runtime.hardware.count_table import NOT_FINITE
 from madns_runtime.hardware.fault_actions import DISCONNECTED, check_fault_fits
-from madns_runtime.hardware.intake import counts_of, silent_inputs
+from madns_runtime.hardware.intake import counts_of, least_stale_age_s, silent_inputs
 from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.page import DevicePage
@@ -168,6 +168,7 @@ class DrivenDevice:
             "lost": account.times_lost,
             "restarts": self.restarts,
             "unsafe": int(is_unsafe),
+            "least_stale_age_s": least_stale_age_s(self.seat.page, self.limits),
             "silent_inputs": silent_inputs(self.seat.channels, self.seat.page),
             "why": NOT_MADE_SAFE if is_unsafe else self.loss or self.why,
             "report": dict(self.report) if self.report is not None else self._counts(),

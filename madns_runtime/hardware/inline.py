@@ -12,7 +12,7 @@ from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.contract import Device, SimulatedDevice
 from madns_runtime.hardware.driver_answers import identity_of
 from madns_runtime.hardware.fault_actions import DISCONNECTED
-from madns_runtime.hardware.intake import Intake, silent_inputs
+from madns_runtime.hardware.intake import Intake, least_stale_age_s, silent_inputs
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
 from madns_runtime.hardware.page import DevicePage
@@ -255,6 +255,7 @@ class InlineDevice:
             "lost": account.times_lost,
             "restarts": 0,
             "unsafe": int(self._page.header[page.MOVED]),
+            "least_stale_age_s": least_stale_age_s(self._page, self._limits),
             "silent_inputs": silent_inputs(self.port.channels.values(), self._page),
             "why": self._why,
             **self._intake.summary(),

@@ -17,6 +17,7 @@ from madns_runtime.hardware.faults import InsertedFaults
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import PREFIX, counts_by_channel
 from madns_runtime.hardware.records import DeviceRecords
+from madns_runtime.hardware.status import StatusLimits
 from madns_runtime.hardware.values import are_finite, hold_to_limits, to_frame, to_numbers
 from madns_runtime.plain_values import is_real
 
@@ -103,6 +104,8 @@ class Intake:
             # Nothing new, as None says it: only a device of outputs alone shows so that it is there.
             self.count("empty_samples")
             return
+        header = self._page.header
+        header[page.LEAST_AGE_S] = min(header[page.LEAST_AGE_S], now_s - sample.taken_s)
         if sample.device_s is not None:
             self.clock.add(sample.device_s, sample.taken_s)
         altered = self.faults.apply(sample)
@@ -255,6 +258,12 @@ def silent_inputs(channels: Iterable[Channel], device_page: DevicePage) -> list[
         and each.passing == "newest"
         and not device_page.read(each.name).number
     ]
+
+
+def least_stale_age_s(device_page: DevicePage, limits: StatusLimits) -> float | None:
+    """Return how old the youngest of all samples was when it came, s; None if there was none, or it was not stale by then."""
+    age_s = device_page.header[page.LEAST_AGE_S]
+    return age_s if limits.stale_s < age_s < math.inf else None
 
 
 class _LastChange:

@@ -31,11 +31,11 @@ ALIGNMENT: Final = 64
 OPENING, CLOSED, OPEN, SAFE = 0.0, 1.0, 2.0, 3.0
 """States of a device: being opened for the first time, not open, open, and left with its outputs made safe."""
 STATE, OPENED_S, ACTIVE_S, SAMPLES, ERRORS, PID, SAFE_COUNT = range(7)
-NEWEST_S, ARRIVED_S, MOVED, LOSSES, ATTEMPTED = range(7, 12)
+NEWEST_S, ARRIVED_S, MOVED, LOSSES, ATTEMPTED, LEAST_AGE_S = range(7, 13)
 """Places in the header, all float64: state, when it was opened and last active (monotonic, s), samples and errors
 so far, process id, how often its outputs were made safe, when its newest sample was taken and when one last arrived,
-1 if outputs have moved since they were last made safe, how often the device was lost, and 1 while the guardian makes
-outputs safe that have moved: nobody knows yet."""
+1 if outputs have moved since they were last made safe, how often the device was lost, 1 while the guardian makes
+outputs safe that have moved: nobody knows yet, and how old the youngest of all samples was when it came, s."""
 HEADER_BYTES: Final = 128
 TIME_NUMBERS: Final = 4
 
@@ -73,6 +73,7 @@ class DevicePage:
         self.header = view[:HEADER_BYTES].cast("d")
         """float64 numbers at the places named above; one process writes them."""
         self.header[NEWEST_S] = self.header[ARRIVED_S] = NEVER
+        self.header[LEAST_AGE_S] = math.inf
         self.loss = TextSlot(view[HEADER_BYTES : HEADER_BYTES + SLOT_BYTES])
         """Why it was lost the last time; the manager writes it."""
         self.counts = CountTable(view[HEADER_BYTES + SLOT_BYTES : time_start])

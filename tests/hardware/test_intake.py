@@ -9,8 +9,9 @@ import pytest
 from madns_runtime.errors import ConfigurationError, PluginError
 from madns_runtime.hardware import page
 from madns_runtime.hardware.contract import Channel, Sample
-from madns_runtime.hardware.intake import Intake
+from madns_runtime.hardware.intake import Intake, least_stale_age_s
 from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.status import StatusLimits
 from madns_runtime.hardware.values import to_numbers, to_output
 
 NAN = float("nan")
@@ -86,6 +87,17 @@ def test_nested_rows_become_numbers_row_by_row():
     matrix = Channel(name="matrix", shape=(2, 2))
 
     assert to_numbers(matrix, [(1, 2), [3, 4]]) == (1.0, 2.0, 3.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("taken_s", "told_s"), [((), None), ((0.0, 2.0), 98.0), ((0.0, 99.95), None)]
+)
+def test_the_least_age_of_samples_is_told_where_each_was_stale_as_it_came(taken_s, told_s):
+    intake, device_page, _ = make_intake()
+    for each in taken_s:
+        intake.take(Sample(values={"level": 1.0}, taken_s=each), 100.0)
+
+    assert least_stale_age_s(device_page, StatusLimits.of(0.1, 1.0, 0.1)) == told_s
 
 
 def test_a_sample_is_on_record_as_handed_over_when_agents_have_it_however_long_that_took():

@@ -17,6 +17,7 @@ from cosmos_cli.evidence.devices import (
     read_devices,
     refusal_remarks,
     silent_input_remarks,
+    stale_sample_remarks,
 )
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import find_streams
@@ -240,6 +241,20 @@ def test_an_input_that_gave_nothing_in_any_incarnation_is_remarked_where_its_dev
     assert devices["pi22/imu"]["silent_inputs"] == ["field"]
     assert silent_input_remarks({f"pi{n}/a": {"silent_inputs": ["x"]} for n in range(25)})[-1] == (
         "5 more devices with an input of which no value ever came"
+    )
+
+
+def test_a_device_of_which_each_sample_was_stale_as_it_came_is_remarked(tmp_path: Path) -> None:
+    old, older = {**SOUND, "least_stale_age_s": 59.0}, {**SOUND, "least_stale_age_s": 99.0}
+    write(tmp_path, "devices.json", pi22_imu=older, pi22_gps=old)
+    write(tmp_path, "devices.2.json", pi22_imu=old, pi22_gps={**SOUND, "least_stale_age_s": None})
+
+    devices = read_devices(RunDirectory(tmp_path), PLAN, None)
+
+    (told,) = stale_sample_remarks(devices)
+    assert told.startswith("device pi22/imu: ")
+    assert told.endswith(
+        "came, the youngest 59 s old when it came: is taken_s time.monotonic() at the read?"
     )
 
 
