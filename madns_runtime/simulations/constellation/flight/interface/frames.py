@@ -43,7 +43,7 @@ class Frames:
     """Both directions of a conversation in frames."""
 
     unended = "which is no whole frame: text goes to standard error"
-    """What is wrong with a rest that does not go on."""
+    """Words on a rest that does not go on."""
 
     def __init__(self) -> None:
         self._dialogue = Dialogue()
@@ -57,7 +57,7 @@ class Frames:
 
     @property
     def rest(self) -> bytes:
-        """What came and is nothing yet."""
+        """Bytes that came and are nothing whole yet."""
         return bytes(self._buffer)
 
     def setup(self, setup: SetupReport) -> list[bytes]:

@@ -111,7 +111,7 @@ class JsonLines:
     answers_by_time = False
     """One answer for each tick, in their order."""
     unended = "without the end of a line"
-    """What is wrong with a rest that does not go on."""
+    """Words on a rest that does not go on."""
 
     def __init__(self) -> None:
         self.faults: dict[str, int] = {}
