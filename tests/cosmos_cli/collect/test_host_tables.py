@@ -80,7 +80,10 @@ def rows(folder, change="{}", agents=AGENTS):
             "{'fields': (Field('agent'),), 'columns': {'agent': times_s}}",
             "must call no field agent",
         ),
-        ("{'fields': (Field('t_s'),), 'columns': {'t_s': times_s}}", "fields with distinct names"),
+        (
+            "{'fields': (Field('t_s', 's'),), 'columns': {'t_s': times_s}}",
+            "fields with distinct names",
+        ),
         ("{'fields': (Field('x_m', 'm', 'odd'),)}", "expected fields of kind"),
         ("{'columns': {'x_m': np.zeros((3, 2))}}", "must yield a value a time of each of x_m"),
         ("{'columns': {'x_m': np.array(['a'] * 3, object)}}", "could not convert string to float"),
