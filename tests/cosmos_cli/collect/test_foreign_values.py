@@ -107,7 +107,7 @@ def test_details_of_an_event_that_are_nested_deeper_than_python_goes_are_counted
 
     summary = collected(made)
 
-    assert "tables/events.parquet: 1 recorded values" in told(summary)
+    assert "tables/events.parquet: 1 values of details (json) are null" in told(summary)
 
 
 def test_an_end_line_with_a_count_beyond_all_counts_is_damaged(made):
