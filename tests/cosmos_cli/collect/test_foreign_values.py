@@ -227,4 +227,4 @@ def test_a_long_text_among_many_numbers_is_null_and_needs_no_memory(tmp_path, ki
     argv = [sys.executable, "-c", GATHERED, str(tmp_path / "0001-x")]
     child = subprocess.run(argv, capture_output=True, text=True, check=False)
 
-    assert child.stdout.startswith("[17001] tables/state.parquet: 1 recorded values"), child.stderr
+    assert child.stdout.startswith("[17001] tables/state.parquet: 1 values of x ("), child.stderr
