@@ -13,8 +13,8 @@ def host_link(
     agent_index: int,
     incarnation_id: int,
     *,
-    limits: LinkLimits = LinkLimits(),  # noqa: B008 - frozen
+    limits: LinkLimits | None = None,
 ) -> Link:
     """Return the host's end, as `Link.for_agent` returns the agent's."""
     seal = Seal.derive(run_key, session, agent_index, incarnation_id, Role.HOST)
-    return Link(seal=seal, limits=limits)
+    return Link(seal=seal, limits=limits or LinkLimits())

@@ -40,10 +40,9 @@ def test_first_answer_of_root_waits_for_sudo_and_later_ones_do_not(is_streamed):
     """A machine tells itself that its sudo is slow; who waits for less long learns nothing."""
 
     class Played(Helper):
-        greeting = {"uid": 1000}  # noqa: RUF012
-        waits = []  # noqa: RUF012
-
         def __init__(self):
+            self.greeting = {"uid": 1000}
+            self.waits = []
             self._is_root_asked = False
             self.machine = "pi01"
 
@@ -56,7 +55,6 @@ def test_first_answer_of_root_waits_for_sudo_and_later_ones_do_not(is_streamed):
             return {"ok": True, "value": None, "part": is_part}, b""
 
     helper = Played()
-    helper.waits = []
     for as_root in (False, True, True):
         if is_streamed:
             list(helper.parts("living", as_root=as_root, timeout_s=20.0))
