@@ -13,6 +13,8 @@ from types import FrameType, TracebackType
 
 from cosmos_cli.system.stop_signals import STOP_SIGNALS
 
+_RAISING = frozenset((signal.SIGINT, signal.SIGTERM))
+
 
 class OperatorSignals:
     """Takes over the signals of a run for as long as it is entered."""
@@ -54,9 +56,16 @@ class OperatorSignals:
         return []
 
     def raise_from_now(self) -> None:
-        """After the loop: let the next Ctrl-C or SIGTERM raise KeyboardInterrupt where the program is."""
+        """
+        After the loop: let a Ctrl-C or SIGTERM raise KeyboardInterrupt where the program is.
+
+        Raises:
+            KeyboardInterrupt: One has come since the loop took the last.
+        """
         self._is_raising = True
+        if not _RAISING.isdisjoint(self.take()):
+            raise KeyboardInterrupt
 
     def _noted(self, number: int, frame: FrameType | None) -> None:
-        if self._is_raising and number in (signal.SIGINT, signal.SIGTERM):
+        if self._is_raising and number in _RAISING:
             raise KeyboardInterrupt
