@@ -119,6 +119,8 @@ def test(
         is_another = seeds is not None or full_length or realtime_s_max is not None
         _refuse_other_tests(set_ or (), is_another=is_another)
     _refuse_section(set_ or ())
+    if seeds is not None:
+        _refuse_seed(set_ or ())
     prepare_junit(junit)
     settings = CaseSettings(
         overrides=tuple(set_ or ()), is_shortened=not full_length, realtime_s_max=realtime_s_max
@@ -184,6 +186,19 @@ def _refuse_section(given: Sequence[str]) -> None:
             key = each.partition("=")[0]
             text = "changes nothing: what a scenario is as a test is read from its file alone; write it there"
             raise InputError(faults=[Fault(text=text, override=key)])
+
+
+def _refuse_seed(given: Sequence[str]) -> None:
+    """
+    Refuse a seed of its own beside those of --seeds.
+
+    Raises:
+        InputError: There is one: it would count in no run.
+    """
+    for each in given:
+        if override_steps(each) == ("seed",):
+            text = "each run has a seed of --seeds already; leave out one of the two"
+            raise InputError(faults=[Fault(text=text, override="seed")])
 
 
 def _instead(junit: Path | None) -> str:

@@ -166,15 +166,17 @@ def check_test(scenario: ScenarioFile, warn: Callable[[str], None]) -> None:
     faults: list[Fault] = []
     omitted = 0
     given = scenario.overrides
-    for look in (
-        lambda: outline.load(outline.overrides(given), warn) if outline.test.set else None,
-        outline.baseline,
-    ):
-        try:
-            look()
-        except InputError as error:
-            faults += map(_of_the_test, error.all_faults)
-            omitted += error.omitted
+    try:
+        if outline.test.set:
+            outline.load(outline.overrides(given), warn)
+    except InputError as error:
+        faults += map(_of_the_test, error.all_faults)
+        omitted += error.omitted
+    try:
+        outline.baseline()
+    except InputError as error:
+        faults += error.all_faults
+        omitted += error.omitted
     if faults:
         faults.sort(key=lambda fault: (bool(fault.override), fault.line or 0, fault.column or 0))
         raise InputError(faults=faults, omitted=omitted)

@@ -171,14 +171,18 @@ def software_remarks(run: RunDirectory, folder: Path, which: str) -> tuple[str, 
             *found,
             f"{run.name} kept no hashes of what it flew: whether {which} flight software is the same is not known",
         )
-    differing = differing_files(flown, folder)
+    differing, new = differing_files(flown, folder), new_files(flown, folder)
     if differing:
         found.append(f"{which} flight software differs: {first_few(differing, SHOWN_MAX)}")
+    if new:
+        found.append(
+            f"{which} flight software has new files beside it: {first_few(new, SHOWN_MAX)}"
+        )
     return tuple(found)
 
 
 def differing_files(flown: FlownFiles, folder: Path) -> list[str]:
-    """Return the files of a folder that are not as they were flown, by name; gone and new ones are told so."""
+    """Return the flown files that a folder has not as they were flown, by name; gone ones are told so."""
     found = []
     for name, one in flown.files.items():
         try:
@@ -190,11 +194,14 @@ def differing_files(flown: FlownFiles, folder: Path) -> list[str]:
             now = None
         if now is None or (now.sha256, now.is_program) != (one.sha256, one.is_program):
             found.append(clean_line(name))
-    if flown.is_whole:
-        found += [
-            f"{clean_line(name)} (new)" for name in names_in(folder) if name not in flown.files
-        ]
     return found
+
+
+def new_files(flown: FlownFiles, folder: Path) -> list[str]:
+    """Return the files of a folder that were not there, by name: software may read them, or they are none of its own."""
+    if not flown.is_whole:
+        return []
+    return [clean_line(name) for name in names_in(folder) if name not in flown.files]
 
 
 def version_remarks(run: RunDirectory) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,6 +17,7 @@ from madns_runtime.partial_file import write_whole
 
 _LINE_START = re.compile(r"(?<=\n)|(?<=\r)(?!\n)")
 """As lines are counted in places: `str.splitlines` knows further ends."""
+_LINE_END = re.compile(r"\r\n|\r|\n")
 _HALVES = re.compile(r"\\ud[89ab][0-9a-f]{2}\\ud[c-f][0-9a-f]{2}")
 _QUOTED = re.compile(r"'(?:[^']|'')*'" r'|"(?:[^"\\]|\\.)*"')
 Edit = tuple[int, int, int, str]
@@ -52,9 +54,12 @@ def update_baseline(baseline: Baseline, compared: Sequence[ComparedFigure]) -> i
         raise InputError(
             f"{baseline.path}: was changed while the tests ran; nothing is written: run them again"
         )
+    # A link to a baseline that is shared stays one.
+    file = baseline.path.resolve()
     try:
-        # A link to a baseline that is shared stays one.
-        write_whole(baseline.path.resolve(), text.encode())
+        with open(file, "rb") as before:
+            is_marked = before.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
+        write_whole(file, text.encode("utf-8-sig" if is_marked else "utf-8"))
     except OSError as error:
         raise InputError(f"{baseline.path}: cannot be written: {error.strerror}") from error
     return len(changed)
@@ -147,8 +152,14 @@ def _edit(document: Document, lines: Sequence[str], name: str, text: str) -> Edi
     first = min(own.values(), key=lambda place: (place.line, place.column))
     row, column = first.line - 1, first.column - 1
     is_flow = lines[row][:column].strip() != ""
-    between = ", " if is_flow else "\n" + lines[row][:column]
+    between = ", " if is_flow else _line_end(lines, row) + lines[row][:column]
     return row, column, 0, f"expected: {text}{between}"
+
+
+def _line_end(lines: Sequence[str], row: int) -> str:
+    """Return what ends a line; the last one may have no end, and takes that of the first."""
+    found = _LINE_END.search(lines[row]) or _LINE_END.search(lines[0])
+    return "\n" if found is None else found[0]
 
 
 def _own_keys(document: Document, name: str) -> dict[Path, SourcePlace]:

@@ -90,6 +90,16 @@ def test_all_faults_of_the_section_come_at_once(scenario):
     ]
 
 
+def test_fault_of_a_baseline_blames_no_test_set(scenario, tmp_path):
+    path = scenario("{set: {agents.count: 1}, baseline: b.yaml}")
+    (path.parent / "b.yaml").write_text("figures: {a: {path: x, tolerance: -1}}")
+
+    (fault,) = faults(path)
+
+    assert fault.file.endswith("b.yaml")
+    assert "test.set" not in fault.text
+
+
 def test_validate_checks_the_scenario_as_its_test_changes_it(scenario, capsys):
     path = scenario("{set: {agents.count: 0}}")
 

@@ -216,6 +216,17 @@ def test_values_within_their_tolerance_are_left(baseline):
     assert "expected: 1.0" in found.path.read_text()
 
 
+def test_what_is_written_keeps_the_ends_of_lines_and_the_mark_of_the_file(tmp_path, run):
+    path = tmp_path / "b.yaml"
+    path.write_bytes(b"\xef\xbb\xbffigures:\r\n  a:\r\n    path: x\r\n    tolerance: 1\r\n")
+    found = read_baseline(path)
+
+    assert update_baseline(found, compare_figures(found, run, {"x": 9})) == 1
+    assert path.read_bytes() == (
+        b"\xef\xbb\xbffigures:\r\n  a:\r\n    expected: 9\r\n    path: x\r\n    tolerance: 1\r\n"
+    )
+
+
 @pytest.mark.parametrize("got", [6878137.123456789, 1 / 3, 1e-7 / 3, float(2**60 + 1024), 12.5])
 @pytest.mark.parametrize("tolerance", ["", ", tolerance: 1e-17", ", relative: 1e-15"])
 def test_what_was_written_holds_for_the_same_value_however_small_the_tolerance(

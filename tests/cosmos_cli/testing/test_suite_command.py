@@ -204,6 +204,7 @@ def test_ctrl_c_ends_all_runs_cleanly_and_tells_what_was_found(cosmos, monkeypat
         (("-k", "and"), "-k:1:1: expected a word"),
         (("--seeds", "5..1"), "--seeds: expected a range that goes up"),
         (("--seeds", ""), "--seeds: expected numbers or ranges such as 1..20, got ''"),
+        (("--seeds", "1..2", "--set", "seed=4"), "--set seed: each run has a seed of --seeds"),
         (("none.yaml",), "none.yaml: no such file or folder"),
         (("--set", "agents.count=0"), "agents.count: expected >= 1"),
         (("--set", "test.deadline_s=1"), "--set test.deadline_s: changes nothing"),
