@@ -12,7 +12,8 @@ boards' together: both stand on the same processors here.
 
 cosmos brings along all it needs, checks the content of every file, and has each board send a datagram here
 and back. Its `fetch` verifies and clears up: it is the time of `collect` less that of a second one, which
-judges, reports and packages alike but has nothing to fetch.
+judges, reports and packages alike but has nothing to fetch, and with that of `collect --help`: the start of the
+program, which is in both, belongs to fetching as it does with the others.
 """
 
 from __future__ import annotations
@@ -65,6 +66,10 @@ class Cost:
             wall_s=max(0.0, self.wall_s - other.wall_s), cpu_s=max(0.0, self.cpu_s - other.cpu_s)
         )
 
+    def plus(self, other: Cost) -> Cost:
+        """Return both together."""
+        return Cost(wall_s=self.wall_s + other.wall_s, cpu_s=self.cpu_s + other.cpu_s)
+
 
 def main() -> None:
     """Measure every fleet and print a table."""
@@ -109,10 +114,15 @@ def table(costs: dict[int, dict[str, dict[str, list[Cost]]]]) -> str:
                 cost = median(figures[job])
                 cell = f"{cost.wall_s:.2f} ({cost.cpu_s:.2f})"
                 if name != COSMOS:
-                    cell += f" {cost.wall_s / own.wall_s:.2f}x ({cost.cpu_s / own.cpu_s:.2f}x)"
+                    cell += f" {times(cost.wall_s, own.wall_s)} ({times(cost.cpu_s, own.cpu_s)})"
                 cells.append(cell)
             lines.append(f"  {job:12}" + "".join(f"{cell:>28}" for cell in cells))
     return "\n".join(lines)
+
+
+def times(theirs_s: float, own_s: float) -> str:
+    """Return how many times longer the others take; a dash where ours took no time that could be measured."""
+    return f"{theirs_s / own_s:.2f}x" if own_s > 0 else "-"
 
 
 def median(costs: list[Cost]) -> Cost:
@@ -134,7 +144,7 @@ def measure(name: str, count: int, programs: Path) -> Iterator[tuple[str, Cost]]
             yield JOBS[2], spent(tower, cosmos.exec)
             cosmos.record()
             whole, again = spent(tower, cosmos.collect), spent(tower, cosmos.judge_again)
-            yield JOBS[3], whole.less(again)
+            yield JOBS[3], fetching(whole, again, spent(tower, cosmos.start))
             yield COLLECT, whole
             return
         contender = RIVALS[name](make_job(cosmos), programs)
@@ -152,6 +162,11 @@ def measure(name: str, count: int, programs: Path) -> Iterator[tuple[str, Cost]]
         found = sum(path.is_file() for path in fetched.rglob("*"))
         if found != count * len(names):
             raise SystemExit(f"{name} fetched {found} files of {count * len(names)}")
+
+
+def fetching(whole: Cost, again: Cost, start: Cost) -> Cost:
+    """Return what of a *whole* `collect` is fetching, its program's *start* included; *again* is one that fetches nothing."""
+    return whole.less(again).plus(start)
 
 
 def spent(tower: Tower, act: Callable[[], None]) -> Cost:
@@ -198,6 +213,10 @@ class Cosmos:
     def judge_again(self) -> None:
         """Do all of `collect` but fetching."""
         self._cosmos("collect", "last", "--no-retrieve")
+
+    def start(self) -> None:
+        """Do nothing but what `collect` begins with: the interpreter and all that it imports."""
+        self._cosmos("collect", "--help")
 
     def warm_up(self) -> None:
         """Fill the cache of wheels, as anybody's is after the first board."""

@@ -29,7 +29,18 @@ from pathlib import Path
 import msgpack
 import numpy as np
 from cosmos_runs import counter
-from stars import LINGER_S, WARM_UP_S, Pace, Shape, bare_star, cpu_of, figures_of, fork, save
+from stars import (
+    LINGER_S,
+    WARM_UP_S,
+    Pace,
+    Shape,
+    bare_star,
+    cpu_of,
+    figures_of,
+    fork,
+    newest_due,
+    save,
+)
 
 from madns_runtime.protocol.datagram import HEADER_REST, MAC_BYTES, LinkKeys, Role, Seal
 from madns_runtime.reactor import libc
@@ -191,13 +202,12 @@ def ping(
             if fd == timer:
                 os.read(timer, 8)
                 begun_s = time.monotonic()
-                if number >= ticks:
-                    continue
-                lateness.append(1e6 * (begun_s - t0_s - phase_s - number / hz))
-                sent_s[number] = begun_s
-                client.send(end.write(number))
-                # Whole periods overslept are missed.
-                number = max(number + 1, int((time.monotonic() - t0_s - phase_s) * hz))
+                number = newest_due(number, begun_s - t0_s - phase_s, hz)
+                if number < ticks:
+                    lateness.append(1e6 * (begun_s - t0_s - phase_s - number / hz))
+                    sent_s[number] = begun_s
+                    client.send(end.write(number))
+                number += 1
                 arm()
             else:
                 answered = end.read(client.recv(2048))

@@ -88,17 +88,23 @@ static void agents(struct sockaddr_in *host, double t0_s, double hz, long ticks,
             continue;
         }
         struct pack *pack = &packs[next];
-        double begun_s = now_s();
+        double begun_s = now_s(), first_s = t0_s + pack->phase_s;
+        /* As in runs: a tick that could not begin within its period is missed, and the newest due one begins. */
+        long newest = (long)((begun_s - first_s) * hz);
+        if (newest > pack->k)
+            pack->k = newest;
+        if (pack->k >= ticks) {
+            left--;
+            continue;
+        }
         double *value = &values[3 * (next * ticks + pack->k)];
         value[0] = pack->size;
-        value[1] = 1e6 * (begun_s - due_s);
+        value[1] = 1e6 * (begun_s - first_s - pack->k / hz);
         char data[PACKET_BYTES * 8] = {0};
         struct packet packet = {next, pack->k, begun_s};
         memcpy(data, &packet, sizeof packet);
         send(client, data, PACKET_BYTES * pack->size, 0);
-        long following = (long)((now_s() - t0_s - pack->phase_s) * hz);
-        pack->k = following > pack->k + 1 ? following : pack->k + 1;
-        if (pack->k >= ticks)
+        if (++pack->k >= ticks)
             left--;
     }
     struct timeval linger = {.tv_usec = 1000 * LINGER_MS};

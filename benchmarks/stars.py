@@ -1,8 +1,8 @@
 """
 Stars with nothing in them: one echo process and agents that time the way there and back.
 
-In Python over UDP, TCP or ZeroMQ, and in C over UDP (stars.c). Same processes, packs, phases and scheduling policy
-as a run's: no seal, no acknowledgement, no records, and one message per pack.
+In Python over UDP, TCP or ZeroMQ, and in C over UDP (stars.c). Same processes, packs, phases, scheduling policy
+and rule of missed ticks as a run's: no seal, no acknowledgement, no records, and one message per pack.
 """
 
 from __future__ import annotations
@@ -176,6 +176,15 @@ def save(path: Path, work: Callable[[], dict[str, list[float]] | None]) -> None:
     np.savez(path, cpu_s=time.process_time() - before_s, **figures)
 
 
+def newest_due(k: int, since_s: float, hz: int) -> int:
+    """
+    Return the tick to begin instead of the due one *k*, *since_s* after the first deadline, s; the number of ticks or more after the last.
+
+    As in runs, a tick that could not begin within its period is missed, and the newest due one begins.
+    """
+    return max(k, int(since_s * hz))
+
+
 def bare_agents(
     client: Client, pace: Pace, packs: list[tuple[int, float]]
 ) -> dict[str, list[float]]:
@@ -203,14 +212,14 @@ def bare_agents(
                 take()
             continue
         size, phase_s = packs[number]
-        begun_s = time.monotonic()
-        lateness.extend([1e6 * (begun_s - deadline_s)] * size)
-        sent_s[number, k] = begun_s
-        client.send(PACKET.pack(number, k, begun_s).ljust(PACKET_BYTES * size, b"\0"))
-        # Whole periods overslept are missed.
-        k = max(k + 1, int((time.monotonic() - t0_s - phase_s) * hz))
+        begun_s, first_s = time.monotonic(), t0_s + phase_s
+        k = newest_due(k, begun_s - first_s, hz)
         if k < ticks:
-            heapq.heapreplace(due, (t0_s + phase_s + k / hz, number, k))
+            lateness.extend([1e6 * (begun_s - first_s - k / hz)] * size)
+            sent_s[number, k] = begun_s
+            client.send(PACKET.pack(number, k, begun_s).ljust(PACKET_BYTES * size, b"\0"))
+        if k + 1 < ticks:
+            heapq.heapreplace(due, (first_s + (k + 1) / hz, number, k + 1))
         else:
             heapq.heappop(due)
         if len(sent_s) > 1000:

@@ -44,6 +44,9 @@ class AgentTicks:
     """Steps that ended later than is tolerated, as far as whole microseconds tell."""
 
 
+NO_TICKS = AgentTicks(run=0, missed=0, lateness_ms={}, margin_ms={})
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TickStatistics:
     """Every recorded tick of a run."""
@@ -156,10 +159,15 @@ class TickTotals:
 
 
 def with_told_misses(found: TickStatistics, told: Mapping[str, int]) -> TickStatistics:
-    """Return statistics with the missed ticks that no other followed, too: by agent, records of causes *told* them alone."""
+    """
+    Return statistics with the missed ticks that no other followed, too.
+
+    By agent, others than its ticks *told* them: of one that never ran a tick they are all there is.
+    """
+    known = dict.fromkeys(told, NO_TICKS) | dict(found.agents)
     agents = {
         name: replace(of, missed=max(of.missed, told.get(name, 0)))
-        for name, of in found.agents.items()
+        for name, of in sorted(known.items())
     }
     return replace(found, agents=agents)
 

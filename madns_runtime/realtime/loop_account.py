@@ -214,12 +214,13 @@ class LoopAccount:
         waited_since_s = self._waited.grown_since(mark.at_s)
         absent_s = overslept_s + kept_off_s
         filled_s[Cause.WAKE_UP] = overslept_s + min(kept_off_s, waited_since_s)
-        if stolen_since_s > waited_since_s or math.isinf(waited_since_s):
-            filled_s[Cause.STOLEN] = min(absent_s, stolen_since_s)
-        filled_s[Cause.RECORDING] = min(absent_s, self._writer.computed_within_s(window))
-        kept_s = max(
-            filled_s[Cause.WAKE_UP], filled_s[Cause.RECORDING], filled_s.get(Cause.STOLEN, 0.0)
-        )
+        recorded_s = min(absent_s, self._writer.computed_within_s(window))
+        filled_s[Cause.RECORDING] = recorded_s
+        # What was stolen may have been so from any processor and up to STOLEN_EVERY_S before the mark: it is charged
+        # with no more than nothing else explains. The kernel counts no waiting of a thread while its processor is stolen.
+        waited_s = waited_since_s if math.isfinite(waited_since_s) else 0.0
+        filled_s[Cause.STOLEN] = min(stolen_since_s, max(0.0, absent_s - recorded_s - waited_s))
+        kept_s = max(filled_s[each] for each in (Cause.WAKE_UP, Cause.RECORDING, Cause.STOLEN))
         self.add(Span(Cause.HOUSEKEEPING, NOBODY, looking_s, monotonic()))
         return _Looked(late.due_s, late.began_s, filled_s, steps, timed_s + kept_s)
 

@@ -21,7 +21,7 @@ class Cause(StrEnum):
     START = "start"
     """It is the agent's first tick, and the order to start, or what set-up left to do, came after its deadline."""
     STOLEN = "stolen"
-    """The loop had nothing else to do or was kept from it, and the hypervisor gave the processor to other guests."""
+    """The loop had nothing else to do or was kept from it by nothing in the guest, and the hypervisor gave processors to other guests."""
     GARBAGE = "garbage"
     """Python's collector was at work."""
     RECORDING = "recording"

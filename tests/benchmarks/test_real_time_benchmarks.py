@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ import soak  # noqa: E402
 import star  # noqa: E402
 import star_transports  # noqa: E402
 import stars  # noqa: E402
+
+from madns_runtime.timing.rate import Pacer  # noqa: E402
 
 
 def test_a_shape_has_the_packs_and_the_phases_of_a_run():
@@ -32,6 +35,50 @@ def test_lost_and_missed_are_what_is_not_there():
 
     assert (figures["due"], figures["missed"], figures["lost"]) == (10, 7, 1)
     assert (figures["rtt_p50_us"], figures["late_max_us"]) == (150.0, 3.0)
+
+
+class EchoAtOnce:
+    """An agent process's end whose messages are back after 0.1 ms of simulated time."""
+
+    def __init__(self, clock):
+        self.clock, self.message = clock, None
+
+    def wait(self, seconds):
+        self.clock.now_s += min(seconds, 1e-4)
+        return True
+
+    def send(self, message):
+        self.message = message
+
+    def receive(self):
+        message, self.message = self.message, None
+        return message
+
+
+@pytest.mark.parametrize("overslept_s", [0.0, 0.005, 0.015, 0.025])
+def test_a_bare_star_misses_the_ticks_that_a_run_does(monkeypatch, overslept_s):
+    """At 100 Hz every tenth wait lasts too long."""
+    clock = SimpleNamespace(now_s=100.0, waits=0)
+
+    def sleep(seconds):
+        clock.waits += 1
+        clock.now_s += seconds + 1e-6 + (0 if clock.waits % 10 else overslept_s)
+
+    monkeypatch.setattr(stars, "time", SimpleNamespace(sleep=sleep, monotonic=lambda: clock.now_s))
+    star = stars.bare_agents(EchoAtOnce(clock), stars.Pace(101.0, 100, 200), [(1, 0.0)])
+    clock.now_s, clock.waits = 0.0, 0
+    pacer = Pacer(tick_hz=100.0, phase_s=0.0, duration_s=2.0, overrun_s=0.001)
+    lateness_us = []
+    while not pacer.is_over:
+        sleep(max(0.0, pacer.next_deadline_s() - clock.now_s))
+        timing = pacer.begin(clock.now_s)
+        if timing is not None:
+            lateness_us.append(1e6 * timing.lateness_s)
+            clock.now_s += 1e-4
+            pacer.end(clock.now_s)
+
+    assert len(star["late_us"]) == pacer.run
+    assert max(star["late_us"]) == pytest.approx(max(lateness_us), abs=0.01)
 
 
 def test_the_median_of_pairs_is_of_each_figure_by_itself():

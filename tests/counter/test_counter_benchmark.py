@@ -41,3 +41,19 @@ def test_missed_ticks_that_no_tick_followed_count_and_those_of_a_killed_agent(la
     assert document(run)["benchmark"]["agents"] == {
         "a": {"sent": 7, "returned": 6, "lost": 1, "ticks": 4, "missed": missed}
     }
+
+
+def test_an_agent_that_never_ran_a_tick_has_missed_what_run_json_tells():
+    run = RecordedRun(
+        document={
+            "simulation": {"agents": {"a": {}, "b": {}}},
+            "timing": {"causes_by_agent": {"b": {"absent": 40}}},
+        },
+        tables={"ticks": table(a=[0, 1])},
+        config=None,
+    )
+
+    agents = document(run)["benchmark"]["agents"]
+
+    assert (agents["b"]["ticks"], agents["b"]["missed"]) == (0, 40)
+    assert sum(of["missed"] for of in agents.values()) == 41

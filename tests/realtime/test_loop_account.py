@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 from time import monotonic
 from types import SimpleNamespace
 
@@ -118,15 +119,57 @@ def test_a_writer_that_computed_while_the_loop_was_to_wake_is_the_cause(loop):
     assert loop.account.explain(late) is Cause.RECORDING
 
 
-@pytest.mark.parametrize("count", ["waited", "stolen"])
-def test_a_step_that_blocks_is_not_charged_with_what_the_kernel_counted_long_before(
-    loop, monkeypatch, count
-):
+@pytest.fixture
+def clock(loop, monkeypatch):
+    """Time, s, that passes as a test says, and in which the loop computes nothing."""
     clock = SimpleNamespace(now_s=monotonic())
     monkeypatch.setattr(loop_account, "monotonic", lambda: clock.now_s)
     monkeypatch.setattr(loop_account, "thread_time", float)
     for each in (loop.account._waited, loop.account._stolen):
         monkeypatch.setattr(each, "_now_s", lambda: clock.now_s)
+    return clock
+
+
+def sleep_until(loop, clock, due_s, late_s=0.0):
+    """Sleep, begin ticks and return the one of mine that was due then."""
+    slept_from_s, clock.now_s = clock.now_s, due_s + late_s
+    loop.reactor.slept_s += clock.now_s - slept_from_s
+    loop.reactor.sleeps.append((slept_from_s, clock.now_s))
+    loop.account.begin_ticks(clock.now_s)
+    return LateTick(ME, due_s, clock.now_s, 0.0, PERIOD_S)
+
+
+@pytest.mark.parametrize(
+    ("waited_s", "written_s", "named"),
+    [
+        (0.004, 0.0, Cause.WAKE_UP),
+        (0.0, 0.004, Cause.RECORDING),
+        (0.001, 0.0, Cause.STOLEN),
+        (math.inf, 0.0, Cause.STOLEN),
+    ],
+)
+@pytest.mark.parametrize("stolen_s", [0.01, 0.02])
+def test_what_was_stolen_is_the_cause_of_no_more_than_nothing_else_explains(
+    loop, clock, stolen_s, waited_s, written_s, named
+):
+    """Counted is what was stolen from all processors since a while before the tick, and seven others were in time."""
+    due_s = clock.now_s + PERIOD_S
+    sleep_until(loop, clock, due_s)
+    loop.kernel["stolen"] += stolen_s
+    for number in range(1, 8):
+        sleep_until(loop, clock, due_s + number * PERIOD_S)
+    loop.kernel["waited"] += waited_s
+    loop.writer.computed_s = written_s
+
+    late = sleep_until(loop, clock, due_s + 8 * PERIOD_S, late_s=0.004)
+
+    assert loop.account.explain(late) is named
+
+
+@pytest.mark.parametrize("count", ["waited", "stolen"])
+def test_a_step_that_blocks_is_not_charged_with_what_the_kernel_counted_long_before(
+    loop, clock, count
+):
     # A second in which the loop slept, and waited now and then for a processor.
     for _ in range(100):
         clock.now_s += PERIOD_S

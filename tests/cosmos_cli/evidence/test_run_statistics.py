@@ -96,6 +96,18 @@ def test_what_an_agent_missed_last_counts_also_of_one_that_was_away_on_purpose()
     assert (totals.run, totals.missed) == (880, 100)
 
 
+def test_an_agent_that_never_ran_a_tick_stands_among_the_others_with_what_it_missed():
+    recorded = TickStatistics(agents={"a": agent(40), "c": agent(40)}, lateness_ms={}, margin_ms={})
+
+    agents = with_told_misses(recorded, {"b": 40}).agents
+
+    assert [(name, of.run, of.missed) for name, of in agents.items()] == [
+        ("a", 40, 0),
+        ("b", 0, 40),
+        ("c", 40, 0),
+    ]
+
+
 class Ticks:
     """The ticks of one agent, of all its incarnations, as a table."""
 

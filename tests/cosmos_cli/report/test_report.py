@@ -127,6 +127,26 @@ def test_missed_ticks_by_agent_sum_up_to_those_of_the_run(tmp_path):
     assert "Missed ticks by agent" in titles(sections["Real time"])
 
 
+def test_an_agent_that_never_ran_a_tick_is_the_one_that_missed_them(tmp_path):
+    made = SyntheticRun(tmp_path, make_config(3, ticks=200))
+    for name in ("agent-01", "agent-03"):
+        made.write_agent(name, last=200)
+    result = made.result()
+    result["agents"]["agent-01"]["ticks"]["causes"] = {}
+    del result["agents"]["agent-02"]
+
+    document, sections = build(made, agents=result["agents"])
+
+    rows = table_of(sections["Real time"], "Ticks by agent").rows
+    assert [row[:3] for row in rows] == [
+        ["agent-01", 200, 0],
+        ["agent-02", 0, 200],
+        ["agent-03", 200, 0],
+    ]
+    assert document["timing"]["missed"] == 200
+    assert "Missed ticks by agent" in titles(sections["Real time"])
+
+
 def test_constellation_gets_orbits_elements_and_conserved_quantities(tmp_path):
     made = SyntheticRun(tmp_path).write(with_states=True)
     host = made.recorder("host", "host", INVARIANTS)

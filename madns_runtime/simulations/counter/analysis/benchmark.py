@@ -72,10 +72,10 @@ def _counts(run: RecordedRun) -> dict[str, dict[str, Any]]:
     for agent in mapping_at(run.document, "simulation", "agents"):
         own = run.agent_summary(agent)
         found[agent] = {key: own.get(key) for key in ("sent", "returned", "lost")}
-        if ticks is not None and agent in ticks.sources:
+        if ticks is not None:
             done, missed = _count(ticks, agent)
             # Those that no tick followed are told by the records of causes alone.
-            told = 0 if late is None or agent not in late.sources else _count(late, agent)[1]
+            told = _count(late, agent)[1]
             # Those of an agent that was gone are told by nobody, and run.json alone counts them.
             gone = mapping_at(run.document, "timing", "causes_by_agent", agent).get("absent")
             told += int(gone) if is_real(gone) else 0
@@ -83,9 +83,11 @@ def _counts(run: RecordedRun) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _count(table: RecordedTable, agent: str) -> tuple[int, int]:
-    """Return an agent's records, and the missed ticks that they tell of."""
+def _count(table: RecordedTable | None, agent: str) -> tuple[int, int]:
+    """Return an agent's records, none of one that ran no tick, and the missed ticks that they tell of."""
     records = missed = 0
+    if table is None or agent not in table.sources:
+        return records, missed
     for columns in table.batches(agent, ("missed",), ROWS_MAX):
         records += len(columns["missed"])
         missed += int(np.nansum(columns["missed"]))
