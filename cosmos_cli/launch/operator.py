@@ -145,7 +145,10 @@ class Operator:
             if self._orders is not None:
                 self._orders.close()
                 self._orders = None
-            leftovers = self._let_go() if supervision.is_detached else self._clear_up()
+            if supervision.is_detached:
+                self._let_go()
+            else:
+                self._clear_up()
             self._background.close(BACKGROUND_END_S)
             self._selector.close()
         result = supervision.host_result or self._run.read_left_result()
@@ -153,7 +156,6 @@ class Operator:
             host_result=result,
             interruption=supervision.interruption,
             problems=self._reporter.problems(result),
-            leftovers=leftovers,
             is_detached=supervision.is_detached,
         )
 
@@ -208,13 +210,12 @@ class Operator:
             elif not self._supervision.has_ended(name):
                 yield from child.members()
 
-    def _let_go(self) -> tuple[int, ...]:
-        """Leave a detached run to itself; nobody is left over from it."""
+    def _let_go(self) -> None:
+        """Leave a detached run to itself."""
         for child in self._children.values():
             child.release()
-        return ()
 
-    def _clear_up(self) -> tuple[int, ...]:
+    def _clear_up(self) -> None:
         """End whatever lives, outside of the loop: the last resort, also when the loop itself has failed."""
         for line in self._manual_lines.values():
             line.close()
@@ -222,13 +223,12 @@ class Operator:
         children = tuple(self._children.values())
         with ThreadPoolExecutor(max(1, len(children))) as pool:
             ended = pool.map(lambda child: child.end_by_force(), children)
-            leftovers = tuple(pid for pids in ended for pid in pids)
+            leftovers = [pid for pids in ended for pid in pids]
         for child in children:
             child.close()
         if leftovers:
             self._reporter.problem(f"processes {', '.join(map(str, leftovers))} outlived SIGKILL")
         self._reporter.noise_in_all()
-        return leftovers
 
     # Events ---------------------------------------------------------------------------------------
 

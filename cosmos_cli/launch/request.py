@@ -205,8 +205,6 @@ class LaunchOutcome:
     interruption: Literal["no", "clean", "at once"] = "no"
     problems: tuple[Problem, ...] = ()
     """Problems, each a sentence that names who and why."""
-    leftovers: tuple[int, ...] = ()
-    """Processes that even SIGKILL did not end."""
     is_detached: bool = False
     """Whether the run has not ended, but goes on without its operator."""
 

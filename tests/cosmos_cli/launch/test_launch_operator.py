@@ -143,7 +143,6 @@ def test_run_that_completes_hands_back_the_hosts_result(launched: Launched) -> N
     assert outcome["host_result"]["status"] == "complete"
     assert outcome["interruption"] == "no"
     assert texts(outcome) == []
-    assert outcome["leftovers"] == []
     assert 'launched ["agent-01", "agent-02"] loopback port 40001' in launched.notes
     assert "running\n" in launched.talk
 
