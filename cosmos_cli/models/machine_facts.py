@@ -91,8 +91,6 @@ class Interpreter:
     executable: str
     libc: str = ""
     """Such as glibc 2.36; empty when it is another."""
-    has_venv: bool = True
-    has_ensurepip: bool = True
 
 
 NOEXEC_CURE = "choose another cosmos_root, or mount it with the option exec (`user` and `users` in /etc/fstab mean noexec)"
@@ -117,7 +115,6 @@ class NetworkFacts:
     """The network of a machine."""
 
     receive_buffer_bytes_max: int | None = None
-    receive_buffer_bytes_default: int | None = None
     interface: str | None = None
     """The one by which the operator came; None when nobody knows."""
     is_wireless: bool | None = None

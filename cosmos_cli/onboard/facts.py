@@ -174,13 +174,10 @@ def _release(etc: str) -> dict[str, str]:
 
 
 def _python() -> dict[str, PlainValue]:
-    folder = os.path.dirname(os.__file__)
     return {
         "version": list(sys.version_info[:3]),
         "executable": sys.executable,
         "libc": libc_version(),
-        "has_venv": os.path.isdir(f"{folder}/venv"),
-        "has_ensurepip": os.path.isdir(f"{folder}/ensurepip"),
     }
 
 

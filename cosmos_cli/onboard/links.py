@@ -13,7 +13,7 @@ TEXT_BYTES_MAX = 262_144
 
 
 def network(proc: str, sys_: str) -> dict[str, PlainValue]:
-    """Tell of receive buffers, of the interface by which the operator came, and of Wi-Fi."""
+    """Tell of the receive buffer, of the interface by which the operator came, and of Wi-Fi."""
     wireless = {
         name for name in names_in(f"{sys_}/class/net") if _is_wireless(f"{sys_}/class/net/{name}")
     }
@@ -21,7 +21,6 @@ def network(proc: str, sys_: str) -> dict[str, PlainValue]:
     up = [name for name in wireless if read_text(f"{sys_}/class/net/{name}/operstate") == "up"]
     return {
         "receive_buffer_bytes_max": read_number(f"{proc}/sys/net/core/rmem_max"),
-        "receive_buffer_bytes_default": read_number(f"{proc}/sys/net/core/rmem_default"),
         "interface": interface,
         "is_wireless": interface in wireless if interface else None,
         "wireless_up": sorted(up),

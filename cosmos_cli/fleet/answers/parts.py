@@ -130,8 +130,6 @@ _FACTS: Mapping[str, Shape] = {
             "version": row([size, size, size]),
             "executable": name,
             "libc": name,
-            "has_venv": flag,
-            "has_ensurepip": flag,
         }
     ),
     "clock": record({"utc_s": number, "uptime_s": maybe(number), "boot_id": maybe(name)}),
@@ -152,7 +150,6 @@ _FACTS: Mapping[str, Shape] = {
     "network": record(
         {
             "receive_buffer_bytes_max": maybe(size),
-            "receive_buffer_bytes_default": maybe(size),
             "interface": maybe(name),
             "is_wireless": maybe(flag),
             "wireless_up": names,

@@ -36,7 +36,6 @@ FILES = {
     "proc/meminfo": "MemTotal:  3884152 kB\nMemAvailable:  3500000 kB\n",
     "proc/uptime": "4321.10 12000.00\n",
     "proc/sys/net/core/rmem_max": "212992\n",
-    "proc/sys/net/core/rmem_default": "212992\n",
     "proc/sys/kernel/random/boot_id": "7e9c8f0a-0000-4000-8000-000000000001\n",
 }
 
