@@ -38,7 +38,5 @@ class HalfTimer:
         self._arm()
 
     def _arm(self) -> None:
-        t0_s, next_s = self._port.t0_s, self._half.next_s
         # Not before now: what waits in the sockets has its turn between two calls that are late.
-        due_s = math.inf if t0_s is None or next_s is None else max(t0_s + next_s, monotonic())
-        self._timer.reschedule(due_s)
+        self._timer.reschedule(max(self._port.due_s(self._half.next_s), monotonic()))

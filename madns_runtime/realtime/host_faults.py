@@ -166,11 +166,8 @@ class HostFaults:
         self._port.faults = self._half.carrier.faults = messages
 
     def _arm(self) -> None:
-        next_s, t0_s = self._messages.next_s(), self._port.t0_s
-        if next_s is None or t0_s is None or next_s > self._duration_s:
-            self._timer.reschedule(math.inf)
-        else:
-            self._timer.reschedule(t0_s + next_s)
+        next_s = self._messages.next_s()
+        self._timer.reschedule(self._port.due_s(next_s, end_s=self._duration_s))
 
     def _due(self) -> None:
         if not self._port.is_in(HostState.SIMULATION_START):

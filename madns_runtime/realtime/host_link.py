@@ -136,10 +136,10 @@ class HostPort:
 
     def arm(self) -> None:
         """Arm the session's timer, for what is to be handed over as well."""
-        session_s, carrier_s, t0_s = self.session.get_timer(), self.carrier.next_s(), self.t0_s
+        session_s = self.session.get_timer()
         due_s = math.inf if session_s is None else session_s
-        if t0_s is not None and carrier_s is not None and self.is_in(HostState.SIMULATION_START):
-            due_s = min(due_s, t0_s + carrier_s)
+        if self.is_in(HostState.SIMULATION_START):
+            due_s = min(due_s, self.due_s(self.carrier.next_s()))
         self._timer.reschedule(due_s)
 
     def monotonic_s(self) -> float:
@@ -168,6 +168,16 @@ class HostPort:
     def t_s(self) -> float | None:
         """Return the simulated time, s; None before it runs."""
         return None if self.t0_s is None else self.now_s()
+
+    def due_s(self, t_s: float | None, *, end_s: float = math.inf) -> float:
+        """
+        Return when this machine's monotonic clock will show simulated time *t_s*, s: what a timer waits for.
+
+        It is infinite, never, for None, for a time behind *end_s*, and before simulated time is set.
+        """
+        if self.t0_s is None or t_s is None or t_s > end_s:
+            return math.inf
+        return self.t0_s + t_s
 
     def send(
         self,

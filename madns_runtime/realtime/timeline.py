@@ -112,11 +112,8 @@ class HostTimeline:
         return refusal
 
     def _arm(self) -> None:
-        next_s, t0_s = 0.0 if self._early else self.runner.next_s, self._port.t0_s
-        if next_s is None or t0_s is None or next_s > self._report.duration_s:
-            self._timer.reschedule(math.inf)
-        else:
-            self._timer.reschedule(t0_s + next_s)
+        next_s = 0.0 if self._early else self.runner.next_s
+        self._timer.reschedule(self._port.due_s(next_s, end_s=self._report.duration_s))
 
     def _due(self) -> None:
         if self._port.is_in(HostState.SIMULATION_START):

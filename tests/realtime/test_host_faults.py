@@ -1,6 +1,7 @@
 """Faults that the host of a run in real time orders of agents: who is being killed hears of no other."""
 
 import math
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,7 @@ from madns_runtime.protocol.link_settings import SendQueueFull
 from madns_runtime.protocol.messages import AgentFault, Service
 from madns_runtime.protocol.states import HostState
 from madns_runtime.realtime.host_faults import HostFaults
+from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
 
 
@@ -152,16 +154,18 @@ def test_what_a_fault_holds_beyond_the_end_is_not_handed_in(
         carrier=SimpleNamespace(faults=None),
         intake=None,
     )
+    port: Any = SimpleNamespace(
+        session=Session(),
+        now_s=lambda: now_s[0],
+        send=None,
+        t0_s=0.0,
+        is_in=lambda wanted: state[0] is wanted,
+        faults=None,
+    )
+    port.due_s = partial(HostPort.due_s, port)
     core: Any = SimpleNamespace(
         launch=SimpleNamespace(config=config, phases_s={}),
-        port=SimpleNamespace(
-            session=Session(),
-            now_s=lambda: now_s[0],
-            send=None,
-            t0_s=0.0,
-            is_in=lambda wanted: state[0] is wanted,
-            faults=None,
-        ),
+        port=port,
         half=half,
         guard=lambda call, *arguments: call(*arguments),
         pump=lambda: None,

@@ -230,6 +230,17 @@ def test_what_cannot_be_sent_is_told_to_who_sends_it_also_where_a_fault_would_ho
     assert len(held) == 1
 
 
+@pytest.mark.parametrize(
+    ("t0_s", "t_s", "due_s"),
+    [(100.0, 0.0, 100.0), (100.0, 8.5, 108.5)]
+    + [(100.0, 8.6, math.inf), (100.0, None, math.inf), (None, 0.0, math.inf)],
+)
+def test_a_timer_waits_for_a_simulated_time_of_the_run_alone(port, t0_s, t_s, due_s):
+    port.t0_s = t0_s
+
+    assert port.due_s(t_s, end_s=8.5) == due_s
+
+
 def test_agents_have_time_for_the_last_tick_of_a_run_of_no_whole_periods():
     config = RunConfig(
         run="trial",

@@ -1,5 +1,6 @@
 """The timeline of a host in real time: stops and those that return, and what is met before simulated time runs."""
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -7,6 +8,7 @@ import pytest
 
 from madns_runtime.conditions.condition import Condition, ValueBounds
 from madns_runtime.conditions.reports import HostConditions
+from madns_runtime.realtime.host_link import HostPort
 from madns_runtime.realtime.timeline import HostTimeline
 from madns_runtime.timeline.entries import ScheduledEntry
 from madns_runtime.timeline.runner import OrderedAction
@@ -66,7 +68,7 @@ def a_timeline(
         agents=SimpleNamespace(resolved_names=lambda: ("a", "b"), tick_hz=10.0),
         timeline=entries,
     )
-    port = SimpleNamespace(
+    port: Any = SimpleNamespace(
         session=session,
         now_s=lambda: 2.0,
         monotonic_s=lambda: 102.0,
@@ -75,6 +77,7 @@ def a_timeline(
         must_pump=False,
         is_in=lambda state: True,
     )
+    port.due_s = partial(HostPort.due_s, port)
     core: Any = SimpleNamespace(
         launch=SimpleNamespace(config=config, phases_s={}),
         port=port,
