@@ -17,7 +17,6 @@ from cosmos_cli.commands.fleet_command import (
     ForksOption,
     LimitOption,
     SomeInventoryOption,
-    failure_teller,
     fleet_of,
 )
 from cosmos_cli.doctor.finding import HERE
@@ -25,7 +24,7 @@ from cosmos_cli.doctor.probe import Responder
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.local import LocalConnection
-from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.outcome import Outcome, failed, failure_teller
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
@@ -78,7 +77,7 @@ def floor(
                     connection, seconds, responder=responder, machine=machine, say=console.say
                 )
 
-            outcomes += fleet.each(task, failure_teller(console))
+            outcomes += fleet.each(task, failure_teller(console.say))
     rows = [row for each in outcomes for row in rows_of(each.machine, each.value or ())]
     rows += [
         (each.machine, "", f"failed: {each.failure}", *[""] * (len(COLUMNS) - 3))

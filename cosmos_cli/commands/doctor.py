@@ -19,7 +19,6 @@ from cosmos_cli.commands.fleet_command import (
     ForksOption,
     LimitOption,
     SomeInventoryOption,
-    failure_teller,
 )
 from cosmos_cli.doctor.case import Case, Wants
 from cosmos_cli.doctor.finding import HERE, Finding, Severity, grouped
@@ -31,7 +30,7 @@ from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.fleet import Fleet, fleet_of
 from cosmos_cli.fleet.local import LocalConnection
-from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.outcome import Outcome, failed, failure_teller
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
@@ -191,7 +190,7 @@ class _Examination:
                         needs=self._needs,
                     )
 
-                outcomes = self._fleet.each(task, failure_teller(self._console))
+                outcomes = self._fleet.each(task, failure_teller(self._console.say))
         return [self._ask_here(own_addresses, outcomes), *outcomes]
 
     def _ask_here(

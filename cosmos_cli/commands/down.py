@@ -20,14 +20,13 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     SomeInventoryOption,
     ask_whether_moved,
-    failure_teller,
     where_words,
 )
 from cosmos_cli.errors import ExitCode, InputError, MachinesError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.outcome import Outcome, failed, failure_teller
 from cosmos_cli.fleet.retry_file import offer_retry_of
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.living_processes import (
@@ -127,7 +126,7 @@ def down(
     fleet = Fleetwide(
         options=ConnectOptions(accept_new_host_keys=accept_new_host_keys, listed=by_name(targets)),
         forks=forks,
-        tell=failure_teller(console),
+        tell=failure_teller(console.say),
     )
     outcomes = fleet.look(targets)
     known = _every_run(targets, outcomes)

@@ -34,7 +34,6 @@ __all__ = [
     "PresentInventoryOption",
     "SomeInventoryOption",
     "ask_whether_moved",
-    "failure_teller",
     "finish",
     "fleet_of",
     "row_teller",
@@ -124,16 +123,6 @@ def some_machines(
             f"--host {host}: there is no machine without an inventory; give one with -i"
         )
     return (LOOPBACK,)
-
-
-def failure_teller(console: Console) -> Callable[[Outcome[Any]], None]:
-    """Return what tells each machine's failure when it happens; call it as `on_done`."""
-
-    def tell(outcome: Outcome[Any]) -> None:
-        if outcome.failure is not None:
-            console.say(f"{outcome.machine}: failed: {outcome.failure}")
-
-    return tell
 
 
 def row_teller(

@@ -19,13 +19,12 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     SomeInventoryOption,
     ask_whether_moved,
-    failure_teller,
     where_words,
 )
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.fleet.connection import ConnectOptions
-from cosmos_cli.fleet.outcome import Outcome, failed
+from cosmos_cli.fleet.outcome import Outcome, failed, failure_teller
 from cosmos_cli.fleet.retry_file import offer_retry_of
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.living_processes import (
@@ -99,7 +98,7 @@ def ps(
     fleet = Fleetwide(
         options=ConnectOptions(accept_new_host_keys=accept_new_host_keys, listed=by_name(listed)),
         forks=forks,
-        tell=failure_teller(console),
+        tell=failure_teller(console.say),
     )
     outcomes = fleet.look(_others(distinct([*planned, *listed])))
     living = [*_here(here), *_there(outcomes)]

@@ -17,7 +17,6 @@ from cosmos_cli.commands.fleet_command import (
     ForksOption,
     InventoryOption,
     LimitOption,
-    failure_teller,
     fleet_of,
 )
 from cosmos_cli.commands.run_arguments import RunsOption
@@ -25,7 +24,7 @@ from cosmos_cli.errors import ExitCode
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.failure import MachineFailure
-from cosmos_cli.fleet.outcome import Outcome
+from cosmos_cli.fleet.outcome import Outcome, failure_teller
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption, confirm
 from cosmos_cli.ui.plural import counted
@@ -79,7 +78,7 @@ def wipe(
         findings = look(connection, known, is_all=all_)
         return make_order(findings, is_all=all_, with_uncollected=uncollected)
 
-    found = fleet.each_target(find, failure_teller(console))
+    found = fleet.each_target(find, failure_teller(console.say))
     rows = [row for outcome in found for row in _rows(outcome)]
     if rows:
         console.table(COLUMNS, rows)
@@ -113,7 +112,7 @@ def _carry_out(
         name = connection.target.name
         return carry_out(connection, orders[name], HOLDER, gone[name].append)
 
-    outcomes = chosen.each_target(work, failure_teller(console))
+    outcomes = chosen.each_target(work, failure_teller(console.say))
     return {outcome.machine: outcome for outcome in outcomes}
 
 

@@ -59,6 +59,16 @@ def raise_if_failed(outcomes: Sequence[Outcome[T]], what: str) -> None:
         raise MachinesError(f"{what}: {len(bad)} of {len(outcomes)} machines failed:{lines}")
 
 
+def failure_teller(say: Callable[[str], object]) -> Callable[[Outcome[Any]], None]:
+    """Return what tells each machine's failure by *say* when it happens; call it as `on_done`."""
+
+    def tell(outcome: Outcome[Any]) -> None:
+        if outcome.failure is not None:
+            say(f"{outcome.machine}: failed: {outcome.failure}")
+
+    return tell
+
+
 class InOrder(Generic[T]):
     """
     Passes outcomes on in the order of the inventory, unless a machine keeps the others waiting.

@@ -18,7 +18,7 @@ from cosmos_cli.fleet.connection import Connection, ConnectOptions
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.layout import Layout
-from cosmos_cli.fleet.outcome import Outcome, raise_if_failed
+from cosmos_cli.fleet.outcome import Outcome, failure_teller, raise_if_failed
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.onboard.request_loop import BOOT_ID_FILE
@@ -239,12 +239,12 @@ def reach_machines(  # noqa: PLR0913 - how machines are reached and prepared; al
             return machine
 
     reached: dict[str, RemoteMachine] = {}
+    tell_failure = failure_teller(say)
 
     def done(outcome: Outcome[RemoteMachine]) -> None:
         if outcome.value is not None:
             reached[outcome.machine] = outcome.value
-        if outcome.failure is not None:
-            say(f"{outcome.machine}: failed: {outcome.failure}")
+        tell_failure(outcome)
 
     try:
         raise_if_failed(

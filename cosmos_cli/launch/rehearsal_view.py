@@ -13,7 +13,7 @@ from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.fleet import Fleet
 from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.liveness import SilenceWatch
-from cosmos_cli.fleet.outcome import Outcome
+from cosmos_cli.fleet.outcome import Outcome, failure_teller
 from cosmos_cli.fleet.target import target_of
 from cosmos_cli.launch.feasibility import Feasibility, Resources
 from cosmos_cli.launch.plan import LaunchPlan
@@ -82,7 +82,7 @@ def check_run(console: Console, rehearsal: Rehearsal, asked: Asked) -> int:
         0 if it can start, 2 for what is wrong here, 3 when a machine is unreachable or not ready.
     """
     here = rehearsal.obstacles_here()
-    outcomes = rehearsal.machines(lambda outcome: _tell_failure(console, outcome), console.say)
+    outcomes = rehearsal.machines(failure_teller(console.say), console.say)
     there = unready(outcomes, asked.up_command)
     planned = _up_lines(console, rehearsal, asked, outcomes)
     rows = [_row(outcome.machine, outcome.value) for outcome in outcomes if outcome.value]
@@ -118,11 +118,6 @@ def check_run(console: Console, rehearsal: Rehearsal, asked: Asked) -> int:
         }
     )
     return int(exit_code)
-
-
-def _tell_failure(console: Console, outcome: Outcome[MachineRehearsal]) -> None:
-    if outcome.failure is not None:  # at once: the table waits for the last machine
-        console.say(f"{outcome.machine}: failed: {outcome.failure}")
 
 
 def _up_lines(
