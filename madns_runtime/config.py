@@ -16,6 +16,7 @@ from annotated_types import Ge, Gt, Le, MinLen
 
 from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.conditions.condition import Condition
+from madns_runtime.plain_values import FORBID_EXTRA
 from madns_runtime.plain_values import from_mapping as from_mapping
 from madns_runtime.plain_values import to_mapping as to_mapping
 from madns_runtime.timeline.entries import ScheduledEntry
@@ -26,7 +27,6 @@ SEED_MAX = 2**63 - 1
 """A seed travels in messages as a signed integer of 64 bits."""
 DURATION_S_MAX = 10 * 365.25 * 86_400.0
 """Ten years, of a run and of each wait: a tick's number, every clock and every timer of a run bear the sum of all."""
-FORBID_EXTRA = {"extra": "forbid"}
 
 
 class ScenarioSection:

@@ -26,6 +26,8 @@ CLASSES_KEPT = 256
 MAPPINGS = (dict, Mapping, collections.abc.MutableMapping)
 ATOMS = (str, int, float, bool, bytes, type(None))
 """Types of values that no copy makes anew."""
+FORBID_EXTRA = {"extra": "forbid"}
+"""Of a dataclass that a file is read into, as its `__pydantic_config__`: keys that it does not know are refused."""
 LINE_CHARACTERS_MAX = 200
 """Of a name or a unit that somebody declares."""
 SHOWN_CHARACTERS_MAX = 100

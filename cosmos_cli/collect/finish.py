@@ -26,7 +26,7 @@ from cosmos_cli.collect.machine_sources import RecordingMachines
 from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.unread_files import find_unread, told_unread
 from cosmos_cli.errors import ExitCode, RunFailedError
-from cosmos_cli.evidence.completeness import HOST, ExpectedRecords, find_missing
+from cosmos_cli.evidence.completeness import ExpectedRecords, find_missing
 from cosmos_cli.evidence.devices import expected_devices, read_devices, recorded_files
 from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
 from cosmos_cli.evidence.manifest import build_manifest, pack_run
@@ -59,6 +59,7 @@ from cosmos_cli.evidence.timeline_remarks import timeline_remarks
 from cosmos_cli.evidence.told_counts import with_told_counts
 from cosmos_cli.evidence.verdict import Verdict
 from cosmos_cli.report.html import write_report
+from madns_runtime.conditions.condition import HOST
 from madns_runtime.hardware.action_socket import SOCKET_NAME as ACTIONS_SOCKET
 from madns_runtime.hardware.order_socket import SOCKET_NAME as ORDERS_SOCKET
 from madns_runtime.plain_values import mapping_at

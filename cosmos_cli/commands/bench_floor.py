@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
 from collections.abc import Sequence
 from typing import Annotated
@@ -23,11 +22,10 @@ from cosmos_cli.doctor.finding import HERE
 from cosmos_cli.doctor.probe import Responder
 from cosmos_cli.errors import ExitCode
 from cosmos_cli.fleet.connection import Connection
-from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.local import LocalConnection, this_computer
 from cosmos_cli.fleet.outcome import Outcome, failed, failure_teller
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.retry_file import offer_retry
-from cosmos_cli.fleet.target import Target
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
@@ -35,7 +33,6 @@ from cosmos_cli.ui.plural import counted
 
 SECONDS_DEFAULT = 5.0
 SECONDS_MAX = 60.0
-HERE_ADDRESS = "127.0.0.1"
 
 
 def floor(
@@ -104,9 +101,8 @@ def floor(
 
 def _measure_here(seconds: float, console: Console) -> Outcome[list[Told]]:
     """Measure this computer alone, before it has to answer machines."""
-    target = Target(name=HERE, address=HERE_ADDRESS, connection="local", python=sys.executable)
     return for_each(
-        [target],
+        [this_computer(HERE)],
         lambda target: measure_floor(LocalConnection(target), seconds, say=console.say),
     )[0]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -29,7 +28,7 @@ from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.fleet.connection import Connection
 from cosmos_cli.fleet.fleet import Fleet, fleet_of
-from cosmos_cli.fleet.local import LocalConnection
+from cosmos_cli.fleet.local import LocalConnection, this_computer
 from cosmos_cli.fleet.outcome import Outcome, failed, failure_teller
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.retry_file import offer_retry
@@ -58,7 +57,6 @@ COLUMNS = (
 )
 OF_MACHINES = re.compile(r"^(`cosmos (?:up|reboot|wipe))(?: -i INVENTORY)?(?=[ `])")
 """A command that is the cure itself, and wants an inventory; one behind a line of the inventory names none."""
-HERE_ADDRESS = "127.0.0.1"
 
 Told = dict[str, Any]
 
@@ -196,7 +194,7 @@ class _Examination:
     def _ask_here(
         self, own_addresses: set[str], outcomes: Sequence[Outcome[Told]]
     ) -> Outcome[Told]:
-        target = Target(name=HERE, address=HERE_ADDRESS, connection="local", python=sys.executable)
+        target = this_computer(HERE)
 
         def task(target: Target) -> Told:
             seen = own_addresses - {""}  # a ProxyCommand shows none

@@ -11,6 +11,7 @@ from typing import Any
 from cosmos_cli.evidence.run_directory import RunDirectory
 from cosmos_cli.evidence.streams import INCARNATION_MAX, StreamScan
 from cosmos_cli.ui.foreign_text import clean_line
+from madns_runtime.conditions.condition import HOST
 from madns_runtime.config import RunConfig
 from madns_runtime.plain_values import first_few, mapping_at
 from madns_runtime.recording.records import CLOCK, EVENTS, HEALTH, LOG, PROCESS, TICKS
@@ -21,7 +22,6 @@ MACHINE_STREAMS = (HEALTH.name,)
 LOCKSTEP_STREAMS = (EVENTS.name, LOG.name)
 """Streams of host and agents in lockstep: there are no machines' clocks, lateness or health to record."""
 FAULTS_SHOWN_MAX = 3
-HOST = "host"
 LOCKSTEP = "lockstep"
 """The time mode, in run.json."""
 NOTHING: Mapping[str, str] = MappingProxyType({})

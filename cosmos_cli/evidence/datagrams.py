@@ -13,9 +13,9 @@ from typing import Any, Final
 
 from cosmos_cli.evidence.completeness import NOTHING
 from madns_runtime.plain_values import mapping_at
+from madns_runtime.protocol.messages import SERVICE_NAMES
 from madns_runtime.recording.records import WHOLE_MAX
 
-SERVICES = ("best", "reliable", "sync")
 OWN_NAMES = ("lost", "duplicated", "out_of_order")
 """Names in a simulation's summary."""
 WORDS: Final[Mapping[str, str]] = {
@@ -64,7 +64,7 @@ def packet_counts(
     }
     if not used:
         return {}
-    services = tuple(name for name in SERVICES if name in used) or SERVICES
+    services = tuple(name for name in SERVICE_NAMES if name in used) or SERVICE_NAMES
     return {
         name: _packets_of(
             mapping_at(agents, name, "messages"),
@@ -83,7 +83,7 @@ def duplicates_by_service(agents: Mapping[str, Any]) -> dict[str, int]:
         service: sum(
             _sum(mapping_at(agents, name, "messages"), (service,), "duplicates") for name in agents
         )
-        for service in SERVICES
+        for service in SERVICE_NAMES
     }
 
 

@@ -11,7 +11,6 @@ import orjson
 
 from cosmos_cli.evidence.completeness import ExpectedRecords, is_excused, is_in_lockstep
 from cosmos_cli.evidence.datagrams import (
-    SERVICES,
     datagram_account,
     datagram_remarks,
     duplicates_by_service,
@@ -41,6 +40,7 @@ from cosmos_cli.evidence.verdict import (
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from madns_runtime.config import HardwareSettings, RunConfig
 from madns_runtime.plain_values import mapping_at
+from madns_runtime.protocol.messages import SERVICE_NAMES
 from madns_runtime.recording.newest_values import clean_values
 from madns_runtime.recording.records import WHOLE_MAX
 from madns_runtime.timing.rate import count_ticks
@@ -333,8 +333,8 @@ class Evidence:
 
     def _messages(self) -> dict[str, Any]:
         twice = duplicates_by_service(mapping_at(self.result, "agents"))
-        totals = {name: mapping_at(self.result, "messages", name) for name in SERVICES}
-        return {name: {**totals[name], "duplicates": twice[name]} for name in SERVICES}
+        totals = {name: mapping_at(self.result, "messages", name) for name in SERVICE_NAMES}
+        return {name: {**totals[name], "duplicates": twice[name]} for name in SERVICE_NAMES}
 
     def _timing(self, totals: TickTotals, causes: CauseTotals | None) -> dict[str, Any]:
         return {

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from cosmos_cli.evidence.completeness import is_excused
-from cosmos_cli.evidence.datagrams import SERVICES, whole_count
+from cosmos_cli.evidence.datagrams import whole_count
 from cosmos_cli.evidence.streams import StreamScan
 from madns_runtime.analysis.distribution import Distribution, Summary, rounded
 from madns_runtime.analysis.tables import RecordedTable, Tables
 from madns_runtime.plain_values import mapping_at
+from madns_runtime.protocol.messages import SERVICE_NAMES
 
 US_PER_MS = 1000.0
 LOST = "lost"
@@ -251,7 +252,7 @@ def worst_sources(
     stayed = {
         name: of for name, of in counts.items() if mapping_at(agents, name).get("state") != LOST
     }
-    for service in SERVICES:
+    for service in SERVICE_NAMES:
         for what, among in (("lost", stayed), ("deadlines_broken", counts)):
             told = ((name, mapping_at(of, service).get(what)) for name, of in among.items())
             found[f"messages.{service}.{what}"] = _largest(told)

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from cosmos_cli.evidence.completeness import HOST
 from cosmos_cli.evidence.datagrams import whole_count
 from cosmos_cli.evidence.streams import StreamScan
+from madns_runtime.conditions.condition import HOST
 from madns_runtime.plain_values import mapping_at
 
 

@@ -8,6 +8,7 @@ import select
 import selectors
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 
@@ -28,6 +29,11 @@ END_TIMEOUT_S = 5.0
 END_POLL_S = 0.25
 """Time between looks whether a command that says nothing has ended."""
 READ_BYTES = 262_144
+
+
+def this_computer(name: str) -> Target:
+    """Return this computer as a target, with the Python that runs here."""
+    return Target(name=name, address=LOOPBACK, connection="local", python=sys.executable)
 
 
 class LocalConnection:

@@ -22,7 +22,7 @@ from cosmos_cli.models.document import Document, read_document
 from cosmos_cli.models.text_forms import NonBlank
 from cosmos_cli.models.translate import faults_of
 from cosmos_cli.models.yaml_source import YamlSource, read_source
-from madns_runtime.config import FORBID_EXTRA
+from madns_runtime.plain_values import FORBID_EXTRA
 
 FIGURES_MAX = 1000
 _PATH_FORM = re.compile(r'[^.\[\]]+(?:\.[^.\[\]]+|\[[0-9]{1,9}\]|\["[^"]+"\])*')

@@ -14,7 +14,7 @@ from cosmos_cli.models.document import Document, did_you_mean
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.known_streams import KnownDevice, channel_fields
 from cosmos_cli.models.scenario import Scenario, SectionFault
-from cosmos_cli.models.text_forms import DEVICE_NAME
+from cosmos_cli.models.text_forms import RECORDED_NAME
 from madns_runtime.config import ScenarioDevice
 from madns_runtime.plugin.api import DeviceUse
 
@@ -60,7 +60,7 @@ def hardware_faults(
     faults = [fault for answer in answers for fault in answer.faults]
     found: list[SectionFault] = []
     for path, device, answer in zip(paths, devices, answers, strict=True):
-        if not DEVICE_NAME.fullmatch(device.name):
+        if not RECORDED_NAME.fullmatch(device.name):
             text = (
                 "expected a name such as sense_hat: at most 64 letters, digits, '.', '_' and '-', of which the first is a"
                 f" letter or a digit; got {device.name!r:.80}"

@@ -14,9 +14,8 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from madns_runtime.config import FORBID_EXTRA
 from madns_runtime.errors import PluginError
-from madns_runtime.plain_values import CLASSES_KEPT, types_of_fields
+from madns_runtime.plain_values import CLASSES_KEPT, FORBID_EXTRA, types_of_fields
 from madns_runtime.plugin.code_places import place_of
 from madns_runtime.plugin.parameter_kinds import kind_faults
 

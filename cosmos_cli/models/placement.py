@@ -12,7 +12,7 @@ from annotated_types import Ge, MinLen
 from cosmos_cli.models.agent_labels import NO_LABELS, AgentLabels
 from cosmos_cli.models.document import did_you_mean, may_guess
 from cosmos_cli.models.text_forms import DeviceName, NonBlank
-from madns_runtime.config import FORBID_EXTRA
+from madns_runtime.plain_values import FORBID_EXTRA
 
 RuleFault = tuple[tuple[str | int, ...], str]
 """The path within the list of rules, and what is wrong there."""

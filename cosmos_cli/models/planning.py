@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from annotated_types import Ge, Gt, Le, MinLen
 
-from madns_runtime.config import FORBID_EXTRA
+from madns_runtime.plain_values import FORBID_EXTRA
 from madns_runtime.plugin.api import Demand, Flow
 
 AMOUNT_MAX = 1e18

@@ -6,7 +6,6 @@ A setting thus has one home, `madns_runtime.config`; what a single field cannot 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,7 +17,7 @@ from cosmos_cli.models.check_rules import CHECKS_MAX, CheckRule
 from cosmos_cli.models.placement import PlacementRule, claim_agents
 from cosmos_cli.models.planning import Planning
 from cosmos_cli.models.scenario_test import ScenarioTest, faults_of_test
-from cosmos_cli.models.text_forms import NAME_PATTERN, ScenarioRequirement
+from cosmos_cli.models.text_forms import NAME_PATTERN, RECORDED_NAME, ScenarioRequirement
 from cosmos_cli.models.timeline_rules import ENTRIES_MAX
 from madns_runtime.agent_parameters import AgentParameters
 from madns_runtime.config import (
@@ -37,7 +36,6 @@ from madns_runtime.config import (
 )
 from madns_runtime.timeline.entries import ScheduledEntry
 
-AGENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 RESERVED_NAMES = ("host",)
 EXECUTOR_KINDS = ("process", "thread", "dask")
 
@@ -183,7 +181,7 @@ def _names(scenario: Scenario) -> Iterator[SectionFault]:
         path = ("agents", "names", index)
         if name.lower() in RESERVED_NAMES:
             yield path, f"{name!r} is reserved; give the agent another name"
-        elif not AGENT_NAME.fullmatch(name):
+        elif not RECORDED_NAME.fullmatch(name):
             text = "expected letters, digits, '.', '_' or '-' (a folder is named after the agent)"
             yield path, f"{text}, got {name!r}"
         elif name.lower() in seen:

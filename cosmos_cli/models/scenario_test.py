@@ -15,7 +15,7 @@ from cosmos_cli.errors import Fault, InputError
 from cosmos_cli.models.document import Path
 from cosmos_cli.models.overrides import KEY_FORM
 from cosmos_cli.models.text_forms import like
-from madns_runtime.config import FORBID_EXTRA
+from madns_runtime.plain_values import FORBID_EXTRA
 
 DEADLINE_S_MAX = 30 * 86_400.0
 TAGS_MAX = 32

@@ -168,7 +168,7 @@ SystemUser = Annotated[
     like(r"[A-Za-z0-9_][A-Za-z0-9_.-]*\$?", "the name of a user or group"),
 ]
 """Its number does as well."""
-DEVICE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-"""A folder of records bears it, and what is ordered of a device: no path, and nothing hidden."""
-DeviceName = Annotated[str, like(DEVICE_NAME.pattern, "the name of a device such as sense_hat")]
+RECORDED_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+"""Of an agent, a machine or a device: a folder of records bears it. No path, and nothing hidden."""
+DeviceName = Annotated[str, like(RECORDED_NAME.pattern, "the name of a device such as sense_hat")]
 NonBlank = Annotated[str, like(r"(?s).*\S.*", "a text that is not blank")]

@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 
 from cosmos_cli.models.text_forms import NonBlank
 from cosmos_cli.models.value_rules import AwaitedRule
-from madns_runtime.config import FORBID_EXTRA
+from madns_runtime.plain_values import FORBID_EXTRA
 
 ENTRIES_MAX: Final = 1000
 RATE_PER_H_MAX: Final = 3600

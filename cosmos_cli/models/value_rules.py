@@ -12,7 +12,7 @@ from annotated_types import Ge
 
 from cosmos_cli.models.text_forms import NonBlank
 from madns_runtime.conditions.condition import ValueBounds
-from madns_runtime.config import FORBID_EXTRA
+from madns_runtime.plain_values import FORBID_EXTRA
 from madns_runtime.recording.records import Field
 from madns_runtime.units import conversion, converted
 

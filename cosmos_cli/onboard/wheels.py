@@ -43,6 +43,7 @@ PROGRAM_MODE, FILE_MODE = 0o755, 0o644
 HASHES = ("sha256", "sha384", "sha512")
 """Hashes that the specification lets RECORD use."""
 SIGNATURES = ("RECORD.jws", "RECORD.p7s")
+"""Files beside RECORD that it does not name."""
 
 
 @verb("wheel")

@@ -37,6 +37,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
+from cosmos_cli.onboard.wheels import HASHES, SIGNATURES
 from cosmos_cli.provision.lock import Locked
 from cosmos_cli.provision.platform import Platform
 from cosmos_cli.system import file_lock
@@ -51,8 +52,6 @@ LEFT_OUT_FOLDERS = ("numpy/distutils/", "numpy/f2py/", "numpy/_pyinstaller/")
 TESTS = "tests"
 LEFT_OUT_SUFFIXES = (".pyi", ".pxd", ".pyx", ".c", ".h", ".a")
 """Stubs, and what a compiler reads."""
-HASHES = ("sha256", "sha384", "sha512")
-SIGNATURES = ("RECORD.jws", "RECORD.p7s")
 NOTE = "sent.json"
 NOTE_BYTES_MAX = 4096
 SENT_TIME = (1980, 1, 1, 0, 0, 0)

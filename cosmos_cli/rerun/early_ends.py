@@ -9,8 +9,8 @@ from cosmos_cli.diff.stream import SAME_TIME_S, TICK_TOLERANCE, Alone, StreamDif
 from cosmos_cli.rerun.recorded_run import RecordedAgent
 from cosmos_cli.ui.name_ranges import names_by
 from cosmos_cli.ui.plural import counted
+from madns_runtime.conditions.condition import HOST
 
-HOST = "host"
 AGENTS_NAMED_MAX = 5
 """In one remark each; of more it is told how many."""
 

@@ -17,10 +17,11 @@ from cosmos_cli.models.scenario import Scenario
 from cosmos_cli.models.separate_process import SeparateDefect, SeparateFailure, work_separately
 from cosmos_cli.models.yaml_source import yaml_text
 from cosmos_cli.rerun.carried_over import ATTEMPTS_MAX, CarriedOver, carried_over
-from cosmos_cli.rerun.early_ends import HOST, early_ends
+from cosmos_cli.rerun.early_ends import early_ends
 from cosmos_cli.rerun.recorded_run import FlownRun, UsedDevice
 from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.plural import counted
+from madns_runtime.conditions.condition import HOST
 from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
 from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.hardware.contract import Channel

@@ -9,10 +9,9 @@ from typing import Any, Final
 from madns_runtime.faults.intended_losses import IntendedLosses, of_intended
 from madns_runtime.lockstep.frames import Loss
 from madns_runtime.medium.outcomes import between_agents
+from madns_runtime.protocol.messages import SERVICE_NAMES
 from madns_runtime.recording.newest_values import Value, told_columns
 
-SERVICES: Final = ("best", "reliable", "sync")
-"""Names of the classes of service, by number."""
 LOST: Final = "lost"
 """State of an agent that no worker runs."""
 
@@ -30,9 +29,9 @@ class EarlyEnd:
 class AgentAccount:
     """The host's counts of one agent."""
 
-    up: list[int] = field(default_factory=lambda: [0] * len(SERVICES))
+    up: list[int] = field(default_factory=lambda: [0] * len(SERVICE_NAMES))
     """Messages to the host, by class of service."""
-    down: list[int] = field(default_factory=lambda: [0] * len(SERVICES))
+    down: list[int] = field(default_factory=lambda: [0] * len(SERVICE_NAMES))
     too_late: int = 0
     """Messages of those that were sent when nobody was to receive any more."""
     not_sent: int = 0
@@ -91,7 +90,7 @@ class AgentAccount:
     def messages(self) -> dict[str, Any]:
         """Return both directions' counts together; what is sent has arrived."""
         messages: dict[str, Any] = {}
-        for number, service in enumerate(SERVICES):
+        for number, service in enumerate(SERVICE_NAMES):
             count = self.up[number] + self.down[number]
             messages[service] = {"sent": count, "received": count, "lost": 0, "resent": 0}
         messages["sync"]["deadlines_broken"] = self.deadlines_broken
@@ -250,10 +249,10 @@ class RunAccount:
         }
 
     def _totals(self) -> dict[str, dict[str, int]]:
-        added: dict[str, dict[str, int]] = {service: {} for service in SERVICES}
+        added: dict[str, dict[str, int]] = {service: {} for service in SERVICE_NAMES}
         for agent in self.agents:
             messages = agent.messages()
-            for service in SERVICES:
+            for service in SERVICE_NAMES:
                 for name, count in messages[service].items():
                     added[service][name] = added[service].get(name, 0) + count
         return added

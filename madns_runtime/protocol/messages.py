@@ -27,6 +27,10 @@ class Service(IntEnum):
     """Delivery of RELIABLE, in a stream of its own that is sent before any fragment, with a deadline."""
 
 
+SERVICE_NAMES = tuple(service.name.lower() for service in Service)
+"""As people and records name them, by number."""
+
+
 @dataclass(frozen=True, slots=True)
 class Hello:
     """Agent -> host: I am here (AGENT_READY). Repeated until the host answers."""

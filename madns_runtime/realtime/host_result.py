@@ -12,10 +12,9 @@ from madns_runtime.medium.outcomes import between_agents
 from madns_runtime.protocol.events import Phase
 from madns_runtime.protocol.host_peers import Peer
 from madns_runtime.protocol.host_session import HostSession
+from madns_runtime.protocol.messages import SERVICE_NAMES
 from madns_runtime.recording.newest_values import told_columns
 from madns_runtime.recording.records import DEVICE_LOSSES
-
-SERVICES = ("best", "reliable", "sync")
 
 _Ends = tuple[Mapping[str, Any], Mapping[str, Any] | None]
 """Counters of a link as its two ends told them: the host, and the agent, None of one that gave no word."""
@@ -204,7 +203,7 @@ def _messages(
     host_side: Mapping[str, Any] = peer.link.counters.to_mapping() if peer.link else {}
     earlier = zip(peer.retired_counters, peer.retired_records, strict=False)
     ends = [*((host, told.get("messages")) for host, told in earlier), (host_side, agent_side)]
-    joined: dict[str, Any] = {service: _joined(service, ends) for service in SERVICES}
+    joined: dict[str, Any] = {service: _joined(service, ends) for service in SERVICE_NAMES}
     incarnations = (*peer.retired_counters, host_side)
     broken = [side.get("deadlines_broken", 0) for side in incarnations]
     excused = [count for number, count in enumerate(broken, start=1) if number in ended_on_purpose]
@@ -282,10 +281,10 @@ def _totals(agents: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int | No
 
     What was sent to agents that were lost is not judged with the rest, but told: "to_lost_agents".
     """
-    totals: dict[str, dict[str, int | None]] = {service: {} for service in SERVICES}
+    totals: dict[str, dict[str, int | None]] = {service: {} for service in SERVICE_NAMES}
     for agent in agents:
         is_lost = agent["state"] == Phase.LOST.value
-        for service in SERVICES:
+        for service in SERVICE_NAMES:
             total = totals[service]
             for name, count in agent["messages"][service].items():
                 if is_lost and name == "lost":

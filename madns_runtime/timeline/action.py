@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 from madns_runtime.errors import MadnsError
+from madns_runtime.plain_values import FORBID_EXTRA
 
 Lasting = Literal["never", "given", "may", "must"]
 TimeMode = Literal["realtime", "lockstep"]
@@ -17,7 +18,7 @@ CarriedOutBy = Literal["framework", "host", "agent"]
 class NoParameters:
     """Parameters of an action that has none."""
 
-    __pydantic_config__ = {"extra": "forbid"}
+    __pydantic_config__ = FORBID_EXTRA
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

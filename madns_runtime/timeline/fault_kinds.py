@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Final, Literal
 
 from annotated_types import Ge, Gt, Le
 
+from madns_runtime.plain_values import FORBID_EXTRA
 from madns_runtime.timeline.action import ActionKind, TimelineAction
 
 KILL: Final = "kill"
@@ -28,14 +29,13 @@ Probability = Annotated[float, Gt(0), Le(1)]
 DELAY_S_MAX: Final = 3600
 Delay = Annotated[float, Gt(0), Le(DELAY_S_MAX)]
 MUST_CONTINUE: Final = "expected on_agent_loss: continue, got abort: the loss would end the run"
-_FORBID: Final[dict[str, Any]] = {"extra": "forbid"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlowSteps:
     """Parameters of slow."""
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+    __pydantic_config__ = FORBID_EXTRA
 
     factor: Annotated[float, Gt(1), Le(1000)]
     """How many times as long a step takes; in lockstep, where steps take no time, a step is taken in one of so many ticks."""
@@ -45,7 +45,7 @@ class SlowSteps:
 class LostMessages:
     """Parameters of lose_messages."""
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+    __pydantic_config__ = FORBID_EXTRA
 
     probability: Probability = 1.0
     traffic: Traffic = "all"
@@ -56,7 +56,7 @@ class LostMessages:
 class DelayedMessages:
     """Parameters of delay_messages."""
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+    __pydantic_config__ = FORBID_EXTRA
 
     delay_s: Delay
     jitter_s: Annotated[float, Ge(0), Le(DELAY_S_MAX)] = 0.0
@@ -68,7 +68,7 @@ class DelayedMessages:
 class ReorderedMessages:
     """Parameters of reorder_messages."""
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+    __pydantic_config__ = FORBID_EXTRA
 
     probability: Probability = 0.5
     within_s: Delay = 1.0
@@ -80,7 +80,7 @@ class ReorderedMessages:
 class DuplicatedMessages:
     """Parameters of duplicate_messages."""
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+    __pydantic_config__ = FORBID_EXTRA
 
     probability: Probability = 1.0
     traffic: Traffic = "all"
@@ -90,7 +90,7 @@ class DuplicatedMessages:
 class DownLink:
     """Parameters of link_down."""
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+    __pydantic_config__ = FORBID_EXTRA
 
     traffic: Traffic = "all"
 

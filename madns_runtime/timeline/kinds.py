@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 
 from annotated_types import Ge, Le, MaxLen, MinLen
 
-from madns_runtime.plain_values import is_line, shown
+from madns_runtime.plain_values import FORBID_EXTRA, is_line, shown
 from madns_runtime.timeline.action import ActionKind, CarriedOutBy, Lasting, TimeMode
 from madns_runtime.timeline.fault_kinds import FAULT_KINDS
 
@@ -17,7 +17,6 @@ TEXT_CHARACTERS_MAX: Final = 200
 STEP_MS_MAX: Final = 10_000
 DRIFT_PPM_MAX: Final = 500
 """The most that an estimate of the host's clock follows: two crystals differ by less, and a time service slews by so much."""
-FORBID_EXTRA: Final = {"extra": "forbid"}
 ENTRY_KEYS: Final = ("action", "agents", "at_s", "every_s", "when", "rate_per_h", "from_s", "to_s", "for_s")  # fmt: skip
 """Keys of a timeline's entry itself, beside which the action's parameters stand."""
 

@@ -14,8 +14,9 @@ from cosmos_cli.models.device_kinds import DeviceQuestion, ask_kinds
 from cosmos_cli.models.document import Document
 from cosmos_cli.models.document import Path as ValuePath
 from cosmos_cli.models.text_forms import DeviceName, NonBlank
-from madns_runtime.config import FORBID_EXTRA, RATE_HZ_MAX
+from madns_runtime.config import RATE_HZ_MAX
 from madns_runtime.hardware.kind_registry import registered_kinds
+from madns_runtime.plain_values import FORBID_EXTRA
 
 DEVICES: Final = "cosmos_devices"
 

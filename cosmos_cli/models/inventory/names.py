@@ -13,8 +13,9 @@ import re
 import string
 from collections.abc import Sequence
 
+from cosmos_cli.models.text_forms import RECORDED_NAME
+
 MACHINES_MAX = 5000
-MACHINE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 GROUP_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 RESERVED_NAMES = ("host",)
 """Names of folders in a run's directory."""
@@ -97,7 +98,7 @@ def _check_name(name: str, pattern: str) -> None:
         raise ValueError(f"expected a range such as pi[01:24], got {pattern!r}")
     if name in RESERVED_NAMES:
         raise ValueError(f"{name!r} is reserved; give the machine another name")
-    if not MACHINE_NAME.fullmatch(name):
+    if not RECORDED_NAME.fullmatch(name):
         text = f"expected letters, digits, '.', '_' or '-', got {name!r}"
         if ":" in name:
             text += ": give the machine a name, and its address in ansible_host"
