@@ -27,7 +27,7 @@ from star_transports import TRANSPORTS, Client
 
 from madns_runtime.health.probe import pss_bytes
 from madns_runtime.timing.pack_split import split_into_packs
-from madns_runtime.timing.rate import stagger
+from madns_runtime.timing.rate import staggered
 
 PACKET = struct.Struct("<IId")
 PACKET_BYTES = 64
@@ -65,7 +65,7 @@ class Shape(NamedTuple):
             )
         ]
         phase, count = "aligned" if self.aligned else "staggered", sum(map(len, sizes))
-        phases = (stagger(number, count, self.hz, phase=phase) for number in range(count))
+        phases = iter(staggered(count, self.hz, phase=phase))
         return [[(size, next(phases)) for size in own] for own in sizes]
 
 

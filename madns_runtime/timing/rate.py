@@ -128,7 +128,7 @@ class Pacer:
 
     Args:
         tick_hz: Rate, Hz.
-        phase_s: Offset of every deadline, within [0, 1 / tick_hz), s; see `stagger`.
+        phase_s: Offset of every deadline, within [0, 1 / tick_hz), s; see `staggered`.
         duration_s: Simulated time of the run: ticks with index / tick_hz below it are run, s.
         overrun_s: A step that ends this long after its period is an error, before that a warning, s.
 
@@ -339,17 +339,6 @@ class RealTimeFactor:
         if self._first is None or self._last[1] <= self._first[1]:
             return None
         return (self._last[0] - self._first[0]) / (self._last[1] - self._first[1])
-
-
-def stagger(
-    index: int,
-    count: int,
-    tick_hz: float,
-    *,
-    phase: Literal["staggered", "aligned"] = "staggered",
-) -> float:
-    """Return the phase of agent *index* of *count*, in [0, 1 / tick_hz), s; see `staggered`."""
-    return staggered(count, tick_hz, phase=phase)[index]
 
 
 def staggered(

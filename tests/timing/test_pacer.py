@@ -14,7 +14,7 @@ from madns_runtime.timing.rate import (
     count_ticks,
     has_tick_from,
     last_period_s,
-    stagger,
+    staggered,
 )
 
 
@@ -358,7 +358,7 @@ def test_every_due_tick_is_run_missed_or_not_run_and_none_twice(tick_hz, share, 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 10, 24, 93, 1000])
 def test_staggered_phases_divide_the_period_evenly(count):
-    phases = sorted(stagger(index, count, 50.0) for index in range(count))
+    phases = sorted(staggered(count, 50.0))
 
     assert phases == pytest.approx([k / count / 50.0 for k in range(count)])
     assert all(0 <= phase * 50.0 < 1 for phase in phases)
@@ -366,14 +366,15 @@ def test_staggered_phases_divide_the_period_evenly(count):
 
 @pytest.mark.parametrize(("count", "together"), [(24, 4), (93, 5), (1000, 50)])
 def test_neighbours_on_one_machine_are_spread_over_the_period(count, together):
+    phases_s = staggered(count, 1.0)
     for first in range(0, count - together, together):
-        phases = sorted(stagger(index, count, 1.0) for index in range(first, first + together))
+        phases = sorted(phases_s[first : first + together])
         gaps = [b - a for a, b in zip(phases, [*phases[1:], phases[0] + 1], strict=True)]
         assert min(gaps) > 0.3 / together
 
 
 def test_aligned_agents_have_no_phase():
-    assert [stagger(index, 5, 10.0, phase="aligned") for index in range(5)] == [0.0] * 5
+    assert staggered(5, 10.0, phase="aligned") == [0.0] * 5
 
 
 def test_small_lateness_is_told_exactly():
@@ -452,8 +453,8 @@ def test_a_later_end_than_the_runs_own_changes_nothing():
 @pytest.mark.parametrize("duration_s", [0.7, 8.5, 10.0, 61.0])
 def test_no_tick_is_due_behind_the_last_period_whatever_its_phase(tick_hz, duration_s):
     over_s = last_period_s(duration_s, tick_hz)
-    for number in range(5):
-        pacer = make_pacer(tick_hz, stagger(number, 5, tick_hz), duration_s)
+    for phase_s in staggered(5, tick_hz):
+        pacer = make_pacer(tick_hz, phase_s, duration_s)
         assert pacer.deadline_of(pacer.tick_count - 1) < over_s
     assert duration_s <= over_s < duration_s + 1.0 / tick_hz + 1e-9
 

@@ -34,7 +34,7 @@ from cosmos_cli.launch.restarts import Restarts
 from cosmos_cli.models.inventory import Machine, Variables
 from madns_runtime.config import Agents, Network, Recording, RunConfig
 from madns_runtime.timing.pack_split import packs_on_machine
-from madns_runtime.timing.rate import stagger
+from madns_runtime.timing.rate import staggered
 
 CONFIG = RunConfig(
     run="0007-x", scenario="x", simulation="counter", base_directory="/here", agents=Agents(count=4)
@@ -378,7 +378,7 @@ def test_agents_by_themselves_divide_the_period_by_their_numbers() -> None:
     phases_s = request_of(agents, machines).phases_s()
 
     assert sorted(phases_s.values()) == pytest.approx([number / 24 / 100 for number in range(24)])
-    assert [phases_s[name] for name in names] == [stagger(i, 24, 100.0) for i in range(24)]
+    assert [phases_s[name] for name in names] == staggered(24, 100.0)
 
 
 def test_aligned_packs_share_the_beginning_of_the_period() -> None:
