@@ -20,7 +20,7 @@ from madns_runtime.simulations.constellation.vehicle.truth_buffer import (
 
 
 @dataclass(slots=True)
-class _Stretch:
+class _BufferedSegment:
     """A segment in a buffer of its own."""
 
     revision: int
@@ -37,17 +37,17 @@ class FutureTruth:
     def __init__(self) -> None:
         self.refused = 0
         """Segments that did not fit the bounds."""
-        self._stretches: list[_Stretch] = []
+        self._segments: list[_BufferedSegment] = []
         self._starts: dict[int, float] = {}
         """First time of each revision, s."""
-        self._in_use: _Stretch | None = None
+        self._in_use: _BufferedSegment | None = None
         self._until_s = -math.inf
         self._attitude: tuple[float, ...] = ()
 
     @property
     def end_s(self) -> float:
         """Simulated time of the last truth held; minus infinity if there is none."""
-        return max((each.end_s for each in self._stretches), default=-math.inf)
+        return max((each.end_s for each in self._segments), default=-math.inf)
 
     def add(self, segment: Segment) -> bool:
         """Take a segment; False if it was refused, or a newer revision has replaced all of it."""
@@ -57,9 +57,7 @@ class FutureTruth:
             return False
         start_s = min(self._starts.get(revision, math.inf), segment.t0_s)
         # Of a vehicle that is commanded at every tick, each future lies as far ahead as the one that replaces it.
-        kept = [
-            each for each in self._stretches if each.revision >= revision or each.t0_s < start_s
-        ]
+        kept = [each for each in self._segments if each.revision >= revision or each.t0_s < start_s]
         held = sum(each.knots for each in kept)
         if len(kept) >= SEGMENTS_MAX or held + knots > KNOTS_HELD_MAX:
             self.refused += 1
@@ -70,14 +68,14 @@ class FutureTruth:
         truth = TruthBuffer()
         truth.add(segment)
         end_s = min(segment.end_s, newer_s)
-        self._stretches = [*kept, _Stretch(revision, segment.t0_s, end_s, knots, truth)]
+        self._segments = [*kept, _BufferedSegment(revision, segment.t0_s, end_s, knots, truth)]
         self._starts[revision] = start_s
         self._in_use = None
         return True
 
     def forget(self, now_s: float) -> None:
         """Let go of what is past."""
-        self._stretches = [each for each in self._stretches if each.end_s >= now_s]
+        self._segments = [each for each in self._segments if each.end_s >= now_s]
         begun = [number for number, at_s in self._starts.items() if at_s <= now_s]
         newest = max(begun, default=0)
         self._starts = {n: at_s for n, at_s in self._starts.items() if n >= newest}
@@ -97,13 +95,13 @@ class FutureTruth:
         self._attitude = attitude
         return state[:6] + attitude + state[10:]
 
-    def _find(self, t_s: float) -> _Stretch | None:
-        """Return the stretch that counts at a time, and note until when it does."""
+    def _find(self, t_s: float) -> _BufferedSegment | None:
+        """Return the segment that counts at a time, and note until when it does."""
         late_s = t_s + TIME_EPSILON_S
         begun = [number for number, at_s in self._starts.items() if at_s <= late_s]
         revision = max(begun, default=None)
-        own = [each for each in self._stretches if each.revision == revision]
-        found: _Stretch | None = None
+        own = [each for each in self._segments if each.revision == revision]
+        found: _BufferedSegment | None = None
         for each in own:
             is_there = each.t0_s <= late_s and t_s <= each.end_s + TIME_EPSILON_S
             if is_there and (found is None or each.t0_s >= found.t0_s):
