@@ -58,7 +58,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class RunPart:
+class RunProcesses:
     """Living processes of one run on one machine."""
 
     run: str
@@ -102,9 +102,9 @@ def ps(
     )
     outcomes = fleet.look(_others(distinct([*planned, *listed])))
     living = [*_here(here), *_there(outcomes)]
-    parts = [part for part in living if run is None or is_called(part.run, part.directory, run)]
-    parts.sort(key=lambda part: (part.run, part.machine or ""))
-    rows = [row for part in parts for row in _rows(part, is_every_agent=all_)]
+    found = [each for each in living if run is None or is_called(each.run, each.directory, run)]
+    found.sort(key=lambda each: (each.run, each.machine or ""))
+    rows = [row for each in found for row in _rows(each, is_every_agent=all_)]
     if rows:
         console.table(COLUMNS, rows)
     bad = failed(outcomes)
@@ -120,7 +120,7 @@ def ps(
     retry = offer_retry_of(console, inventory, listed, [outcome.machine for outcome in bad])
     console.print_json(
         {
-            "runs": _mappings(parts, directories),
+            "runs": _mappings(found, directories),
             "machines": [outcome.to_mapping() for outcome in outcomes],
             "retry": retry,
             "exit_code": int(exit_code),
@@ -129,8 +129,8 @@ def ps(
     return int(exit_code)
 
 
-def _unknown_words(which: str, where: str, living: Sequence[RunPart]) -> str:
-    names = ", ".join(sorted({part.run for part in living})) or "none"
+def _unknown_words(which: str, where: str, living: Sequence[RunProcesses]) -> str:
+    names = ", ".join(sorted({each.run for each in living})) or "none"
     return f"{which}: no such run lives {where}; living runs: {names}"
 
 
@@ -147,23 +147,23 @@ def _directories(here: Sequence[LivingRun], which: str | None) -> list[RunDirect
     ]
 
 
-def _here(runs: Sequence[LivingRun]) -> list[RunPart]:
+def _here(runs: Sequence[LivingRun]) -> list[RunProcesses]:
     return [
-        RunPart(
+        RunProcesses(
             run.run, None, run.directory, {e.pid: age_s(e) for e in run.processes}, run.processes
         )
         for run in runs
     ]
 
 
-def _there(outcomes: Sequence[Outcome[list[Seen]]]) -> list[RunPart]:
+def _there(outcomes: Sequence[Outcome[list[Seen]]]) -> list[RunProcesses]:
     found: dict[tuple[str, str, str], dict[ProcessEntry, float]] = {}
     for outcome in outcomes:  # a machine that is reached by two ways tells the same twice
         for seen in outcome.value or ():
             ages_s = found.setdefault((seen.entry.run, seen.machine, seen.directory), {})
             ages_s[seen.entry] = seen.age_s
     return [
-        RunPart(
+        RunProcesses(
             run,
             machine,
             directory,
@@ -174,34 +174,34 @@ def _there(outcomes: Sequence[Outcome[list[Seen]]]) -> list[RunPart]:
     ]
 
 
-def _rows(part: RunPart, *, is_every_agent: bool) -> list[list[str]]:
-    machine = part.machine or HERE
-    agents = [entry for entry in part.processes if entry.role == "agent"]
-    shown = [entry for entry in part.processes if is_every_agent or entry.role != "agent"]
+def _rows(own: RunProcesses, *, is_every_agent: bool) -> list[list[str]]:
+    machine = own.machine or HERE
+    agents = [entry for entry in own.processes if entry.role == "agent"]
+    shown = [entry for entry in own.processes if is_every_agent or entry.role != "agent"]
     rows = [
         [
-            part.run,
+            own.run,
             machine,
             e.role,
             e.name,
             str(e.pid),
-            age_words(part.ages_s[e.pid]),
-            part.directory,
+            age_words(own.ages_s[e.pid]),
+            own.directory,
         ]
         for e in shown
     ]
     if agents and not is_every_agent:
         # One process may hold several agents; its name lists them.
         count = sum(len(entry.name.split(",")) for entry in agents)
-        oldest = age_words(max(part.ages_s[entry.pid] for entry in agents))
+        oldest = age_words(max(own.ages_s[entry.pid] for entry in agents))
         rows.append(
-            [part.run, machine, "agents", counted(count, "agent"), "", oldest, part.directory]
+            [own.run, machine, "agents", counted(count, "agent"), "", oldest, own.directory]
         )
     return rows
 
 
 def _mappings(
-    parts: Sequence[RunPart], directories: Sequence[RunDirectory]
+    found: Sequence[RunProcesses], directories: Sequence[RunDirectory]
 ) -> list[dict[str, Any]]:
     """Return a mapping a run; its directory is the one here, where it has one."""
     here = {
@@ -210,11 +210,11 @@ def _mappings(
         for source in RecordingMachines.read(run).remote
     }
     runs: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for part in parts:
-        directory = part.directory if part.machine is None else here.get(part.directory)
-        key = (part.run, directory or part.directory)
+    for each in found:
+        directory = each.directory if each.machine is None else here.get(each.directory)
+        key = (each.run, directory or each.directory)
         runs.setdefault(key, []).extend(
-            process_mapping(entry, part.ages_s[entry.pid], part.machine) for entry in part.processes
+            process_mapping(entry, each.ages_s[entry.pid], each.machine) for entry in each.processes
         )
     return [
         {"run": run, "directory": directory, "processes": processes}

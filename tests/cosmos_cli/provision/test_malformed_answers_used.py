@@ -10,7 +10,7 @@ from harness.altered_values import all_altered
 from provision_machines import BOARD, CASES, HOME, machine_of, wanted
 
 from cosmos_cli.collect.wipe import _run_there
-from cosmos_cli.commands.ps import RunPart, _rows
+from cosmos_cli.commands.ps import RunProcesses, _rows
 from cosmos_cli.commands.wipe import _row
 from cosmos_cli.doctor.case import Case, Wants
 from cosmos_cli.doctor.judge import judge
@@ -102,9 +102,9 @@ def use_doctor(value):
 def use_processes(value):
     seen = [_seen("pi01", dict(mapping)) for mapping in value]
     entries = tuple(each.entry for each in seen)
-    part = RunPart("r", "pi01", "d", {each.entry.pid: each.age_s for each in seen}, entries)
-    _rows(part, is_every_agent=True)
-    _rows(part, is_every_agent=False)
+    run = RunProcesses("r", "pi01", "d", {each.entry.pid: each.age_s for each in seen}, entries)
+    _rows(run, is_every_agent=True)
+    _rows(run, is_every_agent=False)
 
 
 def use_runs(value):
