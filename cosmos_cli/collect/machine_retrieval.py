@@ -212,7 +212,7 @@ class MachineRetrieval:
         sizes: list[SizedFile] = []
         arguments = {**self._source.where, "patience_s": PATIENCE_S}
         timeout_s = PATIENCE_S + PIECE_TIMEOUT_S
-        for answer in helper.parts(
+        for answer in helper.pieces(
             "sizes", arguments, timeout_s=timeout_s, whole_s=PATIENCE_S + SIZES_TIMEOUT_S
         ):
             if answer.value.get("gone") is True:
@@ -256,7 +256,7 @@ class MachineRetrieval:
         total = sum(file.size_bytes for file in sizes)
         whole_s, timeout_s = hash_deadline_s(len(sizes), total), PATIENCE_S + PIECE_TIMEOUT_S
         try:
-            yield from helper.parts("manifest", arguments, timeout_s=timeout_s, whole_s=whole_s)
+            yield from helper.pieces("manifest", arguments, timeout_s=timeout_s, whole_s=whole_s)
         except MachineFailure as failure:
             if failure.kind is not FailureKind.TIMEOUT:
                 raise
@@ -314,7 +314,7 @@ class MachineRetrieval:
         files = [[each.file.path, each.offset, each.file.size_bytes] for each in wanted]
         arguments = {**self._source.where, "files": files}
         with PartWriter(wanted, self._run.path) as writer:
-            for answer in helper.parts(
+            for answer in helper.pieces(
                 "fetch", arguments, timeout_s=PIECE_TIMEOUT_S, whole_s=STANDSTILL_S
             ):
                 value = answer.value if isinstance(answer.value, Mapping) else {}

@@ -260,7 +260,7 @@ def _manifest_sha256(helper: Helper, where: Mapping[str, str], note: Note) -> st
     digest, told = hashlib.sha256(), None
     arguments = {**where, "bytes_max": note.bytes}
     whole_s = hash_deadline_s(note.files, note.bytes)
-    for answer in helper.parts("manifest", arguments, timeout_s=PIECE_TIMEOUT_S, whole_s=whole_s):
+    for answer in helper.pieces("manifest", arguments, timeout_s=PIECE_TIMEOUT_S, whole_s=whole_s):
         for entry in answer.value.get("files", ()):
             digest.update(entry_line(entry))
         told = answer.value.get("sha256", told)

@@ -158,14 +158,14 @@ def _change_one(connection: Connection, arguments: dict[str, Any]) -> Changed:
         if not is_check:
             _require_root(helper, target)
             helper.call("lock", {"path": Layout(target.root).lock, "holder": "cosmos packages"})
-        for part in helper.parts(
+        for piece in helper.pieces(
             "packages",
             arguments,
             as_root=not is_check,
             timeout_s=PIECE_TIMEOUT_S,
             whole_s=float(arguments["timeout_s"]) + ANSWER_MARGIN_S,
         ):
-            last = dict(part.value)
+            last = dict(piece.value)
         if "changes" not in last:
             raise MachineFailure(FailureKind.DATA, "ended without saying what it changed")
         if is_check and last["changes"]:

@@ -200,7 +200,7 @@ class Helper:
             header, body = self._read_answer(expected, timeout_s=timeout_s + start_s)
         return Answer(value=header["value"], body=body)
 
-    def parts(
+    def pieces(
         self,
         verb: str,
         arguments: Mapping[str, Any] | None = None,
@@ -230,7 +230,7 @@ class Helper:
             while True:
                 header, body = self._read_answer(expected, timeout_s=timeout_s + start_s)
                 start_s = 0.0
-                if not header.get("part"):
+                if not header.get("piece"):
                     return
                 patience.moved(len(body))
                 if patience.left_s <= 0:
@@ -281,7 +281,7 @@ class Helper:
         """Read one frame; after one that is late or malformed nothing more can be asked."""
         self._is_out_of_step = True
         header, body = self._answers.read(expected, timeout_s=timeout_s)
-        self._is_out_of_step = header.get("part") is True  # the others are still to come
+        self._is_out_of_step = header.get("piece") is True  # the others are still to come
         if not header["ok"]:
             raise failure_of(header["error"])
         return header, body

@@ -103,7 +103,7 @@ class MachineSampler:
         """
         with Helper.start(connection, PARTS, watch=SilenceWatch(connection)) as helper:
             asked = self._asked(helper, machine, launches) | {"has_records": records is not None}
-            answers = helper.parts(
+            answers = helper.pieces(
                 VERB, asked, timeout_s=SIGN_TIMEOUT_S, whole_s=asked["timeout_s"] + ENDING_S
             )
             told, said = read_answer(answers, records)
@@ -188,21 +188,21 @@ def read_answer(answers: Iterator[Answer], records: Path | None) -> tuple[dict[s
     answer = bytearray()
     taken_bytes = 0
     said = ""
-    for part in answers:
-        name = part.value.get("file")
-        said = part.value.get("said", said)
+    for piece in answers:
+        name = piece.value.get("file")
+        said = piece.value.get("said", said)
         if name is None:
             continue
-        taken_bytes += len(part.body)
+        taken_bytes += len(piece.body)
         if name == ANSWER_FILE:
-            answer += part.body
+            answer += piece.body
         elif records is None or not RECORD.fullmatch(name) or ".." in name:
             raise malformed(VERB, "a file that nobody asked for")
         else:
             path = records / name
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("ab") as file:
-                file.write(part.body)
+                file.write(piece.body)
         if len(answer) > ANSWER_BYTES_MAX or taken_bytes > RECORDS_BYTES_MAX + ANSWER_BYTES_MAX:
             raise malformed(VERB, "more than was asked for")
     try:

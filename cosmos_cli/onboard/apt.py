@@ -23,7 +23,7 @@ from cosmos_cli.onboard.apt_words import (
     trouble_of,
 )
 from cosmos_cli.onboard.dpkg import DPKG_QUERY, names_asked, version_of, versions_of
-from cosmos_cli.onboard.request_loop import AnswerPart, HelperRefusal, VerbRequest, verb
+from cosmos_cli.onboard.request_loop import AnswerPiece, HelperRefusal, VerbRequest, verb
 from cosmos_cli.onboard.scratch import scratch_file, scratch_folder
 from cosmos_cli.onboard.system import SIGN_OF_LIFE_S, read_end, start, tool_path, wait
 
@@ -71,7 +71,7 @@ APT::Sandbox::User "";
 """
 """Lists beside the system's; nobody but the user who asks may write there."""
 
-Running = Generator[AnswerPart, None, tuple[int, str]]
+Running = Generator[AnswerPiece, None, tuple[int, str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +83,7 @@ class AptDeadlines:
 
 
 @verb("packages")
-def packages(request: VerbRequest) -> Iterator[AnswerPart]:
+def packages(request: VerbRequest) -> Iterator[AnswerPiece]:
     """
     Change packages; needs root unless it is only a check.
 
@@ -93,13 +93,13 @@ def packages(request: VerbRequest) -> Iterator[AnswerPart]:
             the wait for others.
 
     Yields:
-        Signs of life ("doing": its last line); the last part holds "changes" and "notes".
+        Signs of life ("doing": its last line); the last piece holds "changes" and "notes".
     """
     asked = request.arguments
     names, action = list(asked.get("names") or ()), str(asked["action"])
     wanted = _still_wanted(action, names)
     if names and not wanted:
-        yield AnswerPart(value={"changes": [], "notes": []})
+        yield AnswerPiece(value={"changes": [], "notes": []})
         return
     words = (*WORDS["upgrade_named" if action == "upgrade" and wanted else action], *wanted)
     now_s = time.monotonic()
@@ -121,7 +121,7 @@ def packages(request: VerbRequest) -> Iterator[AnswerPart]:
         notes.append(f"kept back: {' '.join(held)}")
     if os.path.exists(REBOOT_WANTED):
         notes.append("wants a reboot: `cosmos reboot`")
-    yield AnswerPart(value={"changes": changes_between(before, snapshot()), "notes": notes})
+    yield AnswerPiece(value={"changes": changes_between(before, snapshot()), "notes": notes})
 
 
 def installed(names: Sequence[str]) -> dict[str, str | None]:
@@ -184,7 +184,7 @@ def _still_wanted(action: str, names: Sequence[str]) -> list[str]:
 
 def _foresee(
     words: Sequence[str], deadlines: AptDeadlines, *, is_updated: bool
-) -> Iterator[AnswerPart]:
+) -> Iterator[AnswerPiece]:
     """
     Yield what apt-get would change; where it would renew its lists first, that is done beside them.
 
@@ -207,7 +207,7 @@ def _foresee(
             is_renewed = True
     held = kept_back(output)
     notes = [f"kept back: {' '.join(held)}"] if held else []
-    yield AnswerPart(value={"changes": planned_changes(output), "notes": notes})
+    yield AnswerPiece(value={"changes": planned_changes(output), "notes": notes})
 
 
 def _beside(folder: str) -> tuple[str, ...]:
@@ -221,7 +221,7 @@ def _beside(folder: str) -> tuple[str, ...]:
 
 def _persist(
     words: Sequence[str], deadlines: AptDeadlines, notes: list[str], *, is_updated: bool
-) -> Generator[AnswerPart, None, str]:
+) -> Generator[AnswerPiece, None, str]:
     """Run apt-get; finish what was interrupted, and renew the lists, once each, where that may help."""
     done = {"update"} if is_updated else set()
     while True:
@@ -242,7 +242,7 @@ def _persist(
 
 def _update(
     deadlines: AptDeadlines, before: Trouble | None = None, *, options: Sequence[str] = ()
-) -> Iterator[AnswerPart]:
+) -> Iterator[AnswerPiece]:
     """
     Renew the lists; *options* say where others than the system's are.
 
@@ -260,7 +260,7 @@ def _update(
         raise trouble
 
 
-def _configure(deadlines: AptDeadlines) -> Iterator[AnswerPart]:
+def _configure(deadlines: AptDeadlines) -> Iterator[AnswerPiece]:
     status, output = yield from _unlocked(["dpkg", "--configure", "-a"], deadlines)
     if status:
         trouble = trouble_of(output)
@@ -279,7 +279,7 @@ def _unlocked(command: Sequence[str], deadlines: AptDeadlines) -> Running:
         is_locked = status != 0 and trouble_of(output).word == "locked"
         if not is_locked or time.monotonic() > deadlines.lock_s:
             return status, output
-        yield AnswerPart(
+        yield AnswerPiece(
             value={"doing": "waiting for another program that works on packages there"}
         )
         time.sleep(SIGN_OF_LIFE_S)
@@ -297,7 +297,7 @@ def _running(command: Sequence[str], deadlines: AptDeadlines) -> Running:
                     f"{os.path.basename(command[0])} still works there: {_last_line(said)}",
                     "it is left to finish; repeat the command later, or give it a longer --timeout",
                 )
-            yield AnswerPart(value={"doing": _last_line(said)})
+            yield AnswerPiece(value={"doing": _last_line(said)})
         return status, _said(output)
 
 

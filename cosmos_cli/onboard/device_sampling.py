@@ -1,7 +1,7 @@
 """
 Drives devices of a machine without a run, in an environment that `cosmos up` made, and hands over what they gave.
 
-While they are driven, a part is sent twice per second: when nobody takes it any more, they are made safe and closed.
+While they are driven, a piece is sent twice per second: when nobody takes it any more, they are made safe and closed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping
 
 from cosmos_cli.onboard import content_store
 from cosmos_cli.onboard.request_loop import (
-    AnswerPart,
+    AnswerPiece,
     HelperRefusal,
     PlainValue,
     VerbRequest,
@@ -41,9 +41,9 @@ RECORDS_BYTES_MAX = 256 * 1024 * 1024
 
 
 @verb("sample_devices")
-def sample_devices(request: VerbRequest) -> Iterator[AnswerPart]:
+def sample_devices(request: VerbRequest) -> Iterator[AnswerPiece]:
     """
-    Drive devices as the order says; the last parts hold files: the answer, and records if these are wanted.
+    Drive devices as the order says; the last pieces hold files: the answer, and records if these are wanted.
 
     Raises:
         Refusal: TIMEOUT, and it was ended; STEP: it cannot be started, or failed.
@@ -61,7 +61,7 @@ def sample_devices(request: VerbRequest) -> Iterator[AnswerPart]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _driven(asked: Mapping[str, PlainValue], folder: str) -> Iterator[AnswerPart]:
+def _driven(asked: Mapping[str, PlainValue], folder: str) -> Iterator[AnswerPiece]:
     """Run the program to its end, with signs of life."""
     order = {**asked["order"], "directory": folder, "ends_with_input": True}
     with open(f"{folder}/answer.json", "wb") as answer, open(f"{folder}/said", "w+b") as said:
@@ -85,7 +85,7 @@ def _driven(asked: Mapping[str, PlainValue], folder: str) -> Iterator[AnswerPart
                 if time.monotonic() > end_s:
                     text = f"what drives the devices did not end within {asked['timeout_s']:g} s and was ended"
                     raise HelperRefusal("timeout", text, "look at its driver and its device")
-                yield AnswerPart(value={"is_running": True})
+                yield AnswerPiece(value={"is_running": True})
         finally:
             _end(process)
         said.seek(max(0, said.seek(0, os.SEEK_END) - PIECE_BYTES))
@@ -93,7 +93,7 @@ def _driven(asked: Mapping[str, PlainValue], folder: str) -> Iterator[AnswerPart
         if status:
             text = f"what drives the devices ended with {status}: {words or 'without a word'}"
             raise HelperRefusal("step", text)
-        yield AnswerPart(value={"said": words})
+        yield AnswerPiece(value={"said": words})
 
 
 def _order(process: subprocess.Popen[bytes], order: Mapping[str, PlainValue]) -> None:
@@ -123,7 +123,7 @@ def _wait(process: subprocess.Popen[bytes], timeout_s: float) -> int | None:
         return None
 
 
-def _records(folder: str) -> Iterator[AnswerPart]:
+def _records(folder: str) -> Iterator[AnswerPiece]:
     """Yield all that was recorded, within bounds."""
     names = sorted(
         os.path.relpath(os.path.join(top, name), folder)
@@ -138,12 +138,12 @@ def _records(folder: str) -> Iterator[AnswerPart]:
         yield from _file(folder, name)
 
 
-def _file(folder: str, name: str) -> Iterator[AnswerPart]:
+def _file(folder: str, name: str) -> Iterator[AnswerPiece]:
     """Yield a file in pieces, each with the file's name; one that is empty as one piece."""
     with open(f"{folder}/{name}", "rb") as file:
         piece = file.read(PIECE_BYTES)
         while True:
-            yield AnswerPart(value={"file": name}, body=piece)
+            yield AnswerPiece(value={"file": name}, body=piece)
             piece = file.read(PIECE_BYTES)
             if not piece:
                 return

@@ -19,7 +19,7 @@ from collections.abc import Generator, Iterator
 
 from cosmos_cli.onboard.processes import find_living, path_of, wait_for_end
 from cosmos_cli.onboard.request_loop import (
-    AnswerPart,
+    AnswerPiece,
     HelperRefusal,
     PlainValue,
     VerbRequest,
@@ -54,24 +54,24 @@ _listings: dict[tuple[str, str], dict[str, Stamp]] = {}
 
 
 @verb("sizes")
-def sizes(request: VerbRequest) -> Iterator[AnswerPart]:
+def sizes(request: VerbRequest) -> Iterator[AnswerPiece]:
     """List every file below a directory with its size, in batches: nothing of it is read."""
     directory, state = path_of(request, "directory"), path_of(request, "state")
     wait_for_end(directory, state, float(request.arguments.get("patience_s", 0.0)))
     if not is_folder(directory):
-        yield AnswerPart(value={"gone": True})
+        yield AnswerPiece(value={"gone": True})
         return
     batch: list[list[PlainValue]] = []
     for path, (mode, _, size_bytes, _, _) in walk(directory, unread={}):
         batch.append([path, size_bytes if stat.S_ISREG(mode) else 0])
         if len(batch) >= BATCH_FILES:
-            yield AnswerPart(value={"sizes": batch})
+            yield AnswerPiece(value={"sizes": batch})
             batch = []
-    yield AnswerPart(value={"sizes": batch})
+    yield AnswerPiece(value={"sizes": batch})
 
 
 @verb("manifest")
-def manifest(request: VerbRequest) -> Iterator[AnswerPart]:
+def manifest(request: VerbRequest) -> Iterator[AnswerPiece]:
     """
     List every file below a directory, hashed, in batches; at last the hash of the list itself.
 
@@ -85,7 +85,7 @@ def manifest(request: VerbRequest) -> Iterator[AnswerPart]:
     wait_for_end(directory, state, float(request.arguments.get("patience_s", 0.0)))
     if not is_folder(directory):
         sweep(directory)
-        yield AnswerPart(value={"gone": True})
+        yield AnswerPiece(value={"gone": True})
         return
     left_bytes = int(request.arguments["bytes_max"])
     digest = hashlib.sha256()
@@ -103,7 +103,7 @@ def manifest(request: VerbRequest) -> Iterator[AnswerPart]:
         digest.update(entry_line(entry))
         batch.append(entry)
         if len(batch) >= BATCH_FILES or time.monotonic() - sent_s > BATCH_S:
-            yield AnswerPart(value={"files": batch})
+            yield AnswerPiece(value={"files": batch})
             batch, sent_s = [], time.monotonic()
     for path, reason in unread.items():
         batch.append({"path": path, "bytes": 0, "mtime_s": 0, "error": reason})
@@ -112,7 +112,7 @@ def manifest(request: VerbRequest) -> Iterator[AnswerPart]:
     while len(_listings) >= LISTINGS_MAX:
         del _listings[next(iter(_listings))]
     _listings[directory, name] = stamps
-    yield AnswerPart(value={"files": batch, "sha256": name})
+    yield AnswerPiece(value={"files": batch, "sha256": name})
 
 
 def entry_line(entry: Entry) -> bytes:
@@ -121,7 +121,7 @@ def entry_line(entry: Entry) -> bytes:
 
 
 @verb("fetch")
-def fetch(request: VerbRequest) -> Iterator[AnswerPart]:
+def fetch(request: VerbRequest) -> Iterator[AnswerPiece]:
     """Send files, each as [path, first byte, end], in pieces; one that cannot be read does not stop the others."""
     directory, pace = path_of(request, "directory"), PackingTrial()
     for index, (path, offset, end) in enumerate(request.arguments["files"]):
@@ -129,7 +129,7 @@ def fetch(request: VerbRequest) -> Iterator[AnswerPart]:
             whole = os.path.join(directory, path)
             yield from _pieces(index, whole, pace, offset=int(offset), end=int(end))
         except OSError as error:
-            yield AnswerPart(value={"file": index, "error": error.strerror or str(error)})
+            yield AnswerPiece(value={"file": index, "error": error.strerror or str(error)})
 
 
 @verb("release")
@@ -297,7 +297,7 @@ def kind_of(mode: int) -> str:
     return kinds.get(stat.S_IFMT(mode), "a file" if stat.S_ISREG(mode) else "a device")
 
 
-def _described(directory: str, path: str, stamp: Stamp) -> Generator[AnswerPart, None, Entry]:
+def _described(directory: str, path: str, stamp: Stamp) -> Generator[AnswerPiece, None, Entry]:
     """Return the entry of a file; of a large one, signs of life on the way."""
     mode, _, size_bytes, mtime_ns, _ = stamp
     entry: Entry = {"path": path, "bytes": size_bytes, "mtime_s": mtime_ns // 1_000_000_000}
@@ -312,7 +312,7 @@ def _described(directory: str, path: str, stamp: Stamp) -> Generator[AnswerPart,
                 digest.update(data)
                 left_bytes -= len(data)
                 if time.monotonic() - sent_s > BATCH_S:
-                    yield AnswerPart(value={"reading": path})
+                    yield AnswerPiece(value={"reading": path})
                     sent_s = time.monotonic()
             after = _stamp(os.fstat(file.fileno()))
     except OSError as error:
@@ -358,7 +358,7 @@ class PackingTrial:
 
 def _pieces(
     index: int, path: str, pace: PackingTrial, *, offset: int, end: int
-) -> Iterator[AnswerPart]:
+) -> Iterator[AnswerPiece]:
     is_packable = True
     with open(path, "rb", buffering=0, opener=no_links) as file:
         file.seek(offset)
@@ -367,7 +367,7 @@ def _pieces(
             data = file.read(min(PIECE_BYTES, end - offset))
             if not data:
                 text = f"it ends at byte {offset}, expected {end}"
-                yield AnswerPart(value={"file": index, "error": text})
+                yield AnswerPiece(value={"file": index, "error": text})
                 return
             body, packed = data, False
             if is_packable and pace.packs:
@@ -375,7 +375,7 @@ def _pieces(
                 if len(body) > PACKED_SHARE_MAX * len(data):
                     is_packable, packed, body = False, False, data
             value = {"file": index, "offset": offset, "bytes": len(data), "packed": packed}
-            yield AnswerPart(value=value, body=body)
+            yield AnswerPiece(value=value, body=body)
             offset += len(data)
             if is_packable:
                 pace.sent(time.monotonic() - start_s)

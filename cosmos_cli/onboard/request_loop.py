@@ -69,7 +69,7 @@ class VerbRequest:
         self.body = body
 
 
-class AnswerPart:
+class AnswerPiece:
     """One of many pieces of an answer; a verb that returns an iterator of these streams them."""
 
     __slots__ = ("body", "value")
@@ -85,7 +85,7 @@ WHERE: dict[str, str] = {}
 
 
 def verb(name: str) -> Callable[[Handler], Handler]:
-    """Enter a function as the handler of a verb: it returns plain values, or an iterator of `AnswerPart`."""
+    """Enter a function as the handler of a verb: it returns plain values, or an iterator of `AnswerPiece`."""
 
     def enter(handler: Handler) -> Handler:
         VERBS[name] = handler
@@ -170,7 +170,7 @@ class Rooted:
             write_frame(process.stdin, header, body)
         while (frame := read_frame(process.stdout)) is not None:
             write_frame(out, *frame)
-            if not frame[0].get("part"):
+            if not frame[0].get("piece"):
                 return
         raise HelperRefusal("lost", "what runs there as root ended without an answer")
 
@@ -299,8 +299,8 @@ def _answer(header: dict[str, Any], body: bytes, out: BinaryIO) -> None:
     handler = handler_of(str(header.get("verb")))
     value = handler(VerbRequest(arguments=header.get("arguments") or {}, body=body))
     if isinstance(value, Iterator):
-        for part in value:
-            write_frame(out, {"ok": True, "part": True, "value": part.value}, part.body)
+        for piece in value:
+            write_frame(out, {"ok": True, "piece": True, "value": piece.value}, piece.body)
         value = None
     write_frame(out, {"ok": True, "value": value})
 

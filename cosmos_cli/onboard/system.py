@@ -1,7 +1,7 @@
 """
 Requests to the system of a machine: services, and commands of the inventory.
 
-A command may take long: while it runs, a part is sent every second, so that a dead connection is noticed
+A command may take long: while it runs, a piece is sent every second, so that a dead connection is noticed
 soon. A command whose operator is gone goes on to its end, as a package manager must.
 """
 
@@ -22,7 +22,7 @@ from cosmos_cli.onboard.facts import (
     service_state,
 )
 from cosmos_cli.onboard.request_loop import (
-    AnswerPart,
+    AnswerPiece,
     HelperRefusal,
     PlainValue,
     VerbRequest,
@@ -44,9 +44,9 @@ TOOL_FOLDERS = ("/usr/local/sbin", "/usr/sbin", "/sbin")
 NOT_DONE = "it ran, but its `{}` does not hold yet: the next `cosmos up` runs it again"
 
 
-def running(command: Sequence[str], *, timeout_s: float) -> Iterator[AnswerPart]:
+def running(command: Sequence[str], *, timeout_s: float) -> Iterator[AnswerPiece]:
     """
-    Run a command to its end; the last part holds "exit_status" and "output", the end of what it said.
+    Run a command to its end; the last piece holds "exit_status" and "output", the end of what it said.
 
     Raises:
         Refusal: TIMEOUT; it was killed.
@@ -58,10 +58,10 @@ def running(command: Sequence[str], *, timeout_s: float) -> Iterator[AnswerPart]
             while (status := wait(process, SIGN_OF_LIFE_S)) is None:
                 if time.monotonic() > end_s:
                     raise HelperRefusal("timeout", f"not done in {timeout_s:g} s")
-                yield AnswerPart(value={"is_running": True})
+                yield AnswerPiece(value={"is_running": True})
         finally:
             _see_to_end(process, end_s)
-        yield AnswerPart(value={"exit_status": status, "output": last_words(read_end(output))})
+        yield AnswerPiece(value={"exit_status": status, "output": last_words(read_end(output))})
 
 
 def start(command: Sequence[str], output: BinaryIO, **variables: str) -> subprocess.Popen[bytes]:
@@ -109,61 +109,61 @@ def _see_to_end(process: subprocess.Popen[bytes], end_s: float) -> None:
 
 
 @verb("command")
-def command(request: VerbRequest) -> Iterator[AnswerPart]:
+def command(request: VerbRequest) -> Iterator[AnswerPiece]:
     """
     Run a shell command unless it is done already.
 
-    The last part tells whether it "ran", and "notes": that its own condition does not hold even then.
+    The last piece tells whether it "ran", and "notes": that its own condition does not hold even then.
     """
     asked = request.arguments
     if (yield from _is_done(asked)):
-        yield AnswerPart(value={"ran": False})
+        yield AnswerPiece(value={"ran": False})
         return
     yield from _succeeding(["/bin/sh", "-c", asked["run"]], timeout_s=asked["timeout_s"])
     condition = "creates" if asked.get("creates") else "unless"
     is_done_now = yield from _is_done(asked)
     notes = [] if is_done_now else [NOT_DONE.format(condition)]
-    yield AnswerPart(value={"ran": True, "notes": notes})
+    yield AnswerPiece(value={"ran": True, "notes": notes})
 
 
-def _is_done(asked: Mapping[str, PlainValue]) -> Generator[AnswerPart, None, bool]:
+def _is_done(asked: Mapping[str, PlainValue]) -> Generator[AnswerPiece, None, bool]:
     """Return whether a command's condition holds, with signs of life while it is asked."""
     if asked.get("creates"):
         return os.path.lexists(os.path.expanduser(asked["creates"]))
     status = None
     ask, limit_s = condition_command(asked["unless"]), CONDITION_TIMEOUT_S + TOOL_TIMEOUT_S
-    for part in running(ask, timeout_s=limit_s):
-        status = part.value.get("exit_status")
+    for piece in running(ask, timeout_s=limit_s):
+        status = piece.value.get("exit_status")
         if status is None:
-            yield part
+            yield piece
     return condition_holds(asked["unless"], status)
 
 
 def _succeeding(
     command: Sequence[str], name: str = "", *, timeout_s: float
-) -> Iterator[AnswerPart]:
+) -> Iterator[AnswerPiece]:
     """
     Run a command with its signs of life.
 
     Raises:
         Refusal: It failed; the text says *name*, or else its exit status, and what it said. TIMEOUT as `running`.
     """
-    for part in running(command, timeout_s=timeout_s):
-        status = part.value.get("exit_status")
+    for piece in running(command, timeout_s=timeout_s):
+        status = piece.value.get("exit_status")
         if status is None:
-            yield part
+            yield piece
         elif status:
-            said = part.value["output"]
+            said = piece.value["output"]
             space = "\n" if "\n" in said else " "
             raise HelperRefusal("step", f"{name or f'exit status {status}'}:{space}{said}")
 
 
 @verb("service")
-def service(request: VerbRequest) -> Iterator[AnswerPart]:
+def service(request: VerbRequest) -> Iterator[AnswerPiece]:
     """
     Have systemd do things with one service: "do" holds enable, disable, start, stop.
 
-    With "may_be_new" the plan knew of no such unit: what is so by now, or is not there, is left alone. The last part
+    With "may_be_new" the plan knew of no such unit: what is so by now, or is not there, is left alone. The last piece
     tells what it "did".
     """
     asked = request.arguments
@@ -176,10 +176,10 @@ def service(request: VerbRequest) -> Iterator[AnswerPart]:
         if not state or state[_STATE_OF[word]] in _UNDONE[word]:
             yield from _systemctl(word, name, timeout_s=timeout_s)
             did.append(word)
-    yield AnswerPart(value={"did": did if asked.get("do") else ["daemon-reload"]})
+    yield AnswerPiece(value={"did": did if asked.get("do") else ["daemon-reload"]})
 
 
-def _systemctl(*words: str, timeout_s: float) -> Iterator[AnswerPart]:
+def _systemctl(*words: str, timeout_s: float) -> Iterator[AnswerPiece]:
     yield from _succeeding(
         ["systemctl", *words], f"systemctl {' '.join(words)}", timeout_s=timeout_s
     )

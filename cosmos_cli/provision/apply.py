@@ -77,10 +77,10 @@ class Applier:
             answer = self.helper.call(request.verb, request.arguments, body=request.body, **how)
             return _has_changed(request.verb, answer.value)
         value: Mapping[str, Any] = {}
-        for part in self.helper.parts(
+        for piece in self.helper.pieces(
             request.verb, request.arguments, **how, whole_s=request.whole_s
         ):
-            value = part.value or {}
+            value = piece.value or {}
             if value.get("doing"):
                 self.teller.detail(str(value["doing"]))
         self.notes += [f"{step.title}: {note}" for note in value.get("notes") or ()]

@@ -40,7 +40,7 @@ TALKS_ADVICE = (
 )
 
 _whole = record({"ok": exactly(True), "body": whole(), "value": anything})
-_part = record({"ok": exactly(True), "body": whole(), "value": anything, "part": exactly(True)})
+_piece = record({"ok": exactly(True), "body": whole(), "value": anything, "piece": exactly(True)})
 _refused = record({"ok": exactly(False), "body": whole(), "error": error})
 
 
@@ -49,11 +49,11 @@ class ExpectedAnswer:
     """Shape and bounds of an answer."""
 
     shape: Shape
-    """Shape of the answer's value; of one that streams, of the value of each part."""
+    """Shape of the answer's value; of one that streams, of the value of each piece."""
     what: str
     """The question, for messages."""
     is_streamed: bool = False
-    """Whether it comes in parts, and an end without a value."""
+    """Whether it comes in pieces, and an end without a value."""
     body_bytes_max: int = 0
 
 
@@ -159,9 +159,9 @@ def _checked(line: bytes, expected: ExpectedAnswer) -> dict[str, Any]:
         if header["ok"] is not True:
             _refused(header, "")
             return header
-        is_part = header.get("part") is True
-        (_part if expected.is_streamed and is_part else _whole)(header, "")
-        shape = nothing if expected.is_streamed and not is_part else expected.shape
+        is_piece = header.get("piece") is True
+        (_piece if expected.is_streamed and is_piece else _whole)(header, "")
+        shape = nothing if expected.is_streamed and not is_piece else expected.shape
         shape(header["value"], "")
     except WrongShape as fault:
         raise verbs.malformed(expected.what, str(fault)) from None

@@ -54,7 +54,7 @@ ADVICE_CHARACTERS_MAX = 2000
 
 
 def answer_shape(verb: str, asked: Asked) -> Shape:
-    """Return what a verb answers to a question; of one that streams, what each part holds."""
+    """Return what a verb answers to a question; of one that streams, what each piece holds."""
     shape_of = _ANSWERS.get(verb)
     return anything if shape_of is None else shape_of(asked)
 

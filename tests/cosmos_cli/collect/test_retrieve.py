@@ -171,7 +171,7 @@ def test_lines_are_packed_on_the_way_and_noise_is_not(tmp_path):
 
 def test_what_ends_there_at_this_moment_is_waited_for(tmp_path, monkeypatch):
     split = SplitRun(tmp_path, machines=1)
-    parts = Helper.parts
+    pieces = Helper.pieces
 
     with split.living("pi01", "sampler", "pi01") as pid:
         end = threading.Timer(0.3, os.kill, [pid, signal.SIGKILL])
@@ -179,9 +179,9 @@ def test_what_ends_there_at_this_moment_is_waited_for(tmp_path, monkeypatch):
         def ask(board, verb, *arguments, **more):
             if verb == "sizes":
                 end.start()
-            return parts(board, verb, *arguments, **more)
+            return pieces(board, verb, *arguments, **more)
 
-        monkeypatch.setattr(Helper, "parts", ask)
+        monkeypatch.setattr(Helper, "pieces", ask)
         outcome = split.retrieve()["pi01"]
         end.join()
 
@@ -231,7 +231,7 @@ def test_release_is_refused_when_a_file_changed_or_came_after_the_list(tmp_path)
     ]
     for change in changes:
         with Helper.start(LocalConnection(split.targets["pi01"]), PARTS) as board:
-            listed = list(board.parts("manifest", {**where, "bytes_max": 10**9}))
+            listed = list(board.pieces("manifest", {**where, "bytes_max": 10**9}))
             change()
             with pytest.raises(MachineFailure, match="changed since they were listed") as refused:
                 board.call("release", {**where, "manifest_sha256": listed[-1].value["sha256"]})
@@ -244,7 +244,7 @@ def test_release_is_refused_while_something_lives_and_of_what_was_not_listed(tmp
     split = SplitRun(tmp_path, machines=1)
     where = {"directory": str(split.directory("pi01")), "state": str(split.state("pi01"))}
     with Helper.start(LocalConnection(split.targets["pi01"]), PARTS) as board:
-        digest = list(board.parts("manifest", {**where, "bytes_max": 10**9}))[-1].value["sha256"]
+        digest = list(board.pieces("manifest", {**where, "bytes_max": 10**9}))[-1].value["sha256"]
         with (
             split.living("pi01", "supervisor", "pi01"),
             pytest.raises(MachineFailure, match="supervisor pi01") as busy,

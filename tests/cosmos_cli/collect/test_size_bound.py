@@ -35,13 +35,13 @@ Usage = namedtuple("Usage", "total used free")
 def asked(monkeypatch):
     """The verbs that boards are asked for streams of."""
     verbs = []
-    parts = Helper.parts
+    pieces = Helper.pieces
 
     def spy(self, verb, *args, **more):
         verbs.append(verb)
-        return parts(self, verb, *args, **more)
+        return pieces(self, verb, *args, **more)
 
-    monkeypatch.setattr(Helper, "parts", spy)
+    monkeypatch.setattr(Helper, "pieces", spy)
     return verbs
 
 
@@ -110,7 +110,7 @@ def test_helper_itself_reads_no_more_than_it_may(tmp_path):
 
     with Helper.start(LocalConnection(split.targets["pi01"]), retrieve.PARTS) as board:
         with pytest.raises(MachineFailure, match="holds more than 1000000 bytes") as caught:
-            list(board.parts("manifest", {**where, "bytes_max": 1_000_000}))
+            list(board.pieces("manifest", {**where, "bytes_max": 1_000_000}))
         assert caught.value.kind is FailureKind.DATA
 
 

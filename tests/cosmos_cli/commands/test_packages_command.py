@@ -76,7 +76,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any], bo
             if as_root and self.name == "pi05":
                 raise MachineFailure(FailureKind.NO_SUDO, "a password is required", "allow it")
 
-        def parts(
+        def pieces(
             self, verb: str, arguments: dict[str, Any], *, as_root: bool, **deadlines: float
         ) -> Any:
             assert set(deadlines) == {"timeout_s", "whole_s"}

@@ -42,7 +42,7 @@ RAW: tuple[bytes, ...] = (
     b'{"ok":false,"body":0,"error":{"kind":{},"text":[]}}\n',
     b'{"ok":false,"body":0,"error":{"kind":"no such kind","text":"\\ud800"}}\n',
     b'{"ok":"yes","body":0,"value":null}\n',
-    b'{"ok":true,"part":true,"body":0,"value":null}\n',
+    b'{"ok":true,"piece":true,"body":0,"value":null}\n',
     b"Welcome to this board\n",
 )
 """Lines in the place of an answer."""

@@ -53,7 +53,7 @@ PARTS = [
 EMPTY = hashlib.sha256().hexdigest()
 NOT_TRIED = {
     "reboot": "it would reboot this computer",
-    "sample_devices": "it wants an environment: test_device_sampling holds its parts to their shape",
+    "sample_devices": "it wants an environment: test_device_sampling holds its pieces to their shape",
     "wheel": "its answer is null, as a tree's",
 }
 SEEDS = 40
@@ -144,7 +144,7 @@ STREAMED = {"command", "service", "packages", "manifest", "sizes", "fetch"}
 def ask(board, verb, arguments):
     body = b"abc" if verb == "write_file" else b"x\x9c\x03\x00\x00\x00\x00\x01"
     if verb in STREAMED:
-        return [part.value for part in board.parts(verb, arguments, timeout_s=60.0)]
+        return [piece.value for piece in board.pieces(verb, arguments, timeout_s=60.0)]
     return board.call(verb, arguments, body=body, timeout_s=60.0).value
 
 
@@ -194,7 +194,7 @@ def test_altered_answer_is_that_machines_failure_or_of_its_shape(tmp_path, verb)
             got, _ = AnswerReader(Canned(data)).read(expected, timeout_s=30.0)
             told["values"] += 1
             if got["ok"]:
-                shape = expected.shape if not expected.is_streamed or got.get("part") else anything
+                shape = expected.shape if not expected.is_streamed or got.get("piece") else anything
                 shape(got["value"], "")
         except MachineFailure as failure:
             assert failure.kind is FailureKind.DATA, failure

@@ -90,7 +90,7 @@ def test_a_device_is_driven_and_its_records_are_brought(board, tmp_path):
     os.utime(old, (0, 0))
 
     told, _ = read_answer(
-        board.parts(VERB, asked(tmp_path, seconds=3, has_records=True), whole_s=PATIENCE_S),
+        board.pieces(VERB, asked(tmp_path, seconds=3, has_records=True), whole_s=PATIENCE_S),
         tmp_path / "records",
     )
 
@@ -105,7 +105,7 @@ def test_a_device_is_driven_and_its_records_are_brought(board, tmp_path):
 
 def test_what_does_not_end_in_time_is_ended(board, tmp_path):
     with pytest.raises(MachineFailure) as caught:
-        list(board.parts(VERB, asked(tmp_path, seconds=600, timeout_s=3), whole_s=PATIENCE_S))
+        list(board.pieces(VERB, asked(tmp_path, seconds=600, timeout_s=3), whole_s=PATIENCE_S))
 
     assert caught.value.kind is FailureKind.TIMEOUT
     assert "did not end within 3 s" in caught.value.text
@@ -113,12 +113,12 @@ def test_what_does_not_end_in_time_is_ended(board, tmp_path):
 
 
 def test_devices_are_closed_when_nobody_listens_any_more(board, tmp_path):
-    parts = board.parts(VERB, asked(tmp_path, seconds=600), whole_s=PATIENCE_S)
+    pieces = board.pieces(VERB, asked(tmp_path, seconds=600), whole_s=PATIENCE_S)
     noted = tmp_path / "pid"
     # The file is there a moment before what stands in it.
     pid = int(
         wait_until(
-            lambda: next(parts) is not None and noted.exists() and noted.read_text(),
+            lambda: next(pieces) is not None and noted.exists() and noted.read_text(),
             patience_s=PATIENCE_S,
         )
     )
@@ -133,9 +133,9 @@ def test_a_machine_without_its_interpreter_says_what_to_do(board, tmp_path):
     with (
         pytest.raises(MachineFailure, match="no such program") as caught,
         contextlib.closing(
-            board.parts(VERB, asked(tmp_path, seconds=1, python="/nowhere/python"))
-        ) as parts,
+            board.pieces(VERB, asked(tmp_path, seconds=1, python="/nowhere/python"))
+        ) as pieces,
     ):
-        list(parts)
+        list(pieces)
 
     assert "cosmos up" in caught.value.advice

@@ -222,7 +222,7 @@ def packages(apt: PlayedApt) -> Iterator[Packages]:
 
         def packages(action: str, *names: str, **more: Any) -> dict[str, Any]:
             arguments = {"action": action, "names": names, **more}
-            told = [part.value for part in board.parts("packages", arguments)]
+            told = [piece.value for piece in board.pieces("packages", arguments)]
             return dict(told[-1])
 
         yield packages
@@ -385,9 +385,9 @@ def test_apt_goes_on_to_its_end_when_nobody_listens_any_more(apt: PlayedApt) -> 
     apt.hold_up()
     target = Target(name="pi01", address="127.0.0.1", connection="local")
     board = Helper.start(LocalConnection(target), PARTS)
-    parts = board.parts("packages", {"action": "install", "names": ["foo"]})
+    pieces = board.pieces("packages", {"action": "install", "names": ["foo"]})
 
-    assert "doing" in next(parts).value
+    assert "doing" in next(pieces).value
     board.close()
     apt.go_on()
 
@@ -406,6 +406,6 @@ def test_machine_without_apt_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
         Helper.start(LocalConnection(target), PARTS) as board,
         pytest.raises(MachineFailure) as failure,
     ):
-        list(board.parts("packages", {"action": "install", "names": ["foo"]}))
+        list(board.pieces("packages", {"action": "install", "names": ["foo"]}))
 
     assert failure.value.kind is FailureKind.UNSUPPORTED

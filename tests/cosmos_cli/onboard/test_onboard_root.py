@@ -51,13 +51,13 @@ def test_first_answer_of_root_waits_for_sudo_and_later_ones_do_not(is_streamed):
 
         def _read_answer(self, expected, *, timeout_s):
             self.waits.append(timeout_s)
-            is_part = is_streamed and len(self.waits) % 2 == 1
-            return {"ok": True, "value": None, "part": is_part}, b""
+            is_piece = is_streamed and len(self.waits) % 2 == 1
+            return {"ok": True, "value": None, "piece": is_piece}, b""
 
     helper = Played()
     for as_root in (False, True, True):
         if is_streamed:
-            list(helper.parts("living", as_root=as_root, timeout_s=20.0))
+            list(helper.pieces("living", as_root=as_root, timeout_s=20.0))
         else:
             helper.call("living", as_root=as_root, timeout_s=20.0)
 

@@ -197,11 +197,11 @@ def test_unknown_owner_and_special_files_are_refused(tmp_path):
 def test_long_command_gives_signs_of_life(tmp_path, monkeypatch):
     with Helper.start(connection_to(tmp_path), HELPER_PARTS) as board:
         asked = {"run": f"sleep 2.5; touch {tmp_path}/a", "creates": f"{tmp_path}/a"}
-        parts = [p.value for p in board.parts("command", {**asked, "timeout_s": PATIENCE_S})]
+        pieces = [p.value for p in board.pieces("command", {**asked, "timeout_s": PATIENCE_S})]
 
-    assert parts[-1] == {"ran": True, "notes": []}
-    assert parts[:-1]
-    assert all(part == {"is_running": True} for part in parts[:-1])
+    assert pieces[-1] == {"ran": True, "notes": []}
+    assert pieces[:-1]
+    assert all(piece == {"is_running": True} for piece in pieces[:-1])
 
 
 @pytest.mark.process
@@ -221,10 +221,10 @@ def test_slow_condition_of_a_command_gives_signs_of_life(tmp_path):
     unless = f"sleep 1.5; test -e {tmp_path}/a"
     asked = {"run": f"touch {tmp_path}/a", "unless": unless, "timeout_s": PATIENCE_S}
 
-    parts = [part.value for part in system.command(VerbRequest(arguments=asked))]
+    pieces = [piece.value for piece in system.command(VerbRequest(arguments=asked))]
 
-    assert parts[-1] == {"ran": True, "notes": []}
-    assert parts[:-1].count({"is_running": True}) == len(parts) - 1 >= 2
+    assert pieces[-1] == {"ran": True, "notes": []}
+    assert pieces[:-1].count({"is_running": True}) == len(pieces) - 1 >= 2
     assert [p.value for p in system.command(VerbRequest(arguments=asked))][-1] == {"ran": False}
 
 
@@ -294,7 +294,7 @@ def test_command_that_takes_too_long_is_ended_with_its_children(tmp_path):
     asked = {"run": f"sleep 1000 & echo $! > {tmp_path}/pid; wait", "creates": f"{tmp_path}/a"}
     with Helper.start(connection_to(tmp_path), HELPER_PARTS) as board:
         with pytest.raises(MachineFailure, match="not done in 4 s") as failure:
-            list(board.parts("command", {**asked, "timeout_s": 4}))
+            list(board.pieces("command", {**asked, "timeout_s": 4}))
         pid = int((tmp_path / "pid").read_text())
 
         assert failure.value.kind is FailureKind.TIMEOUT
@@ -310,8 +310,8 @@ def test_command_whose_operator_is_gone_is_seen_through(tmp_path):
         "timeout_s": PATIENCE_S,
     }
     board = Helper.start(connection_to(tmp_path), HELPER_PARTS)
-    parts = board.parts("command", asked)
-    assert next(parts).value == {"is_running": True}
+    pieces = board.pieces("command", asked)
+    assert next(pieces).value == {"is_running": True}
 
     board._stream.close_writing()
     board._stream._stdout.close()  # the connection is cut: nobody reads any more
