@@ -73,6 +73,40 @@ def test_gps_time_is_ahead_of_utc_by_the_leap_seconds():
     assert GnssSolution.of((unix_s("2017-01-01T00:00:00Z"), *LEO, *SPEED), 0).time_of_week_ms == 0
 
 
+@pytest.mark.parametrize(
+    ("utc", "leap_s"),
+    [
+        ("1980-01-06T00:00:00Z", 0),
+        ("1999-01-01T00:00:00Z", 13),
+        ("2000-01-01T12:00:00Z", 13),
+        ("2005-12-31T23:59:59.999Z", 13),
+        ("2006-01-01T00:00:00Z", 14),
+        ("2012-01-01T00:00:00Z", 15),
+        ("2015-07-01T00:00:00Z", 17),
+        ("2016-12-31T23:59:59.9994Z", 17),
+        ("2016-12-31T23:59:59.9996Z", 18),  # on a whole millisecond it is 2017
+        ("2017-01-01T00:00:00Z", 18),
+        ("2199-12-31T23:59:59Z", 18),
+    ],
+)
+def test_a_receiver_knows_the_leap_seconds_of_its_epoch(tmp_path, utc, leap_s):
+    assert gps_minus_utc_s(tmp_path, utc) == (leap_s, leap_s)
+    assert gps_minus_utc_s(tmp_path, utc, leap_seconds=18) == (18, 18)
+
+
+def gps_minus_utc_s(folder, utc, **parameters):
+    """Return what a receiver tells of it, and what the two times that it tells differ by, within a day."""
+    parameters |= {"link": "gps", "messages": ["NAV-TIMEGPS", "NAV-TIMEUTC"]}
+    with opened("gnss_receiver", folder, **parameters) as device:
+        device.read()
+        computer = os.open(folder / "gps", os.O_RDONLY | os.O_NOCTTY)
+        device.write({"epoch": (unix_s(utc), *LEO, *SPEED)}, 0.0)
+        gps, told = heard(computer, 2)
+        os.close(computer)
+    of_day_s = 3600 * told.hour + 60 * told.min + told.sec + told.nano * 1e-9
+    return gps.leapS, round(gps.iTOW * 1e-3 - of_day_s, 6) % 86_400
+
+
 def test_an_epoch_is_brought_to_a_whole_millisecond_by_its_velocity():
     base = 1_700_000_000.0
     moved = GnssSolution.of((base + 0.33333, *LEO, *SPEED), 18)

@@ -34,8 +34,8 @@ class GnssReceiverParameters:
         "NAV-TIMEUTC",
     )
     """Messages of each epoch, in this order."""
-    leap_seconds: Annotated[int, Ge(0), Le(127)] = 18
-    """GPS time minus UTC, s: 18 since 2017."""
+    leap_seconds: Annotated[int, Ge(0), Le(127)] | None = None
+    """GPS time minus UTC, s; without it what it was at each epoch: 13 in 2000, 18 since 2017."""
     position_accuracy_m: Annotated[float, Ge(0), Le(10_000)] = 2.5
     """Accuracy that it tells of position; no error is added."""
     velocity_accuracy_m_s: Annotated[float, Ge(0), Le(1000)] = 0.05
