@@ -18,6 +18,7 @@ from harness.cosmos_command import LOOSE, CosmosCommand
 from harness.waiting import wait_until
 from pyubx2 import NMEA_PROTOCOL, UBX_PROTOCOL, UBXReader
 
+from madns_runtime.config import DURATION_S_MAX
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.hardware.gnss_messages import GnssMessage, ToldQuality, encode
 from madns_runtime.hardware.gnss_solution import GnssSolution, geodetic
@@ -29,6 +30,7 @@ from madns_runtime.simulations.constellation.orbit.earth import (
     geodetic_to_fixed,
     gmst_rad,
 )
+from madns_runtime.simulations.constellation.truth.element_set import LAST_YEAR
 from tests.hardware.bench import Terminal
 from tests.hardware.driving import opened
 
@@ -105,6 +107,13 @@ def gps_minus_utc_s(folder, utc, **parameters):
         os.close(computer)
     of_day_s = 3600 * told.hour + 60 * told.min + told.sec + told.nano * 1e-9
     return gps.leapS, round(gps.iTOW * 1e-3 - of_day_s, 6) % 86_400
+
+
+def test_every_year_that_a_scenario_may_have_is_within_the_limits_of_an_epoch(tmp_path):
+    prepared = prepare("gnss_receiver", {"link": "gps"}, tmp_path)
+    [epoch] = [channel for channel in prepared.channels if channel.name == "epoch"]
+
+    assert epoch.limits[1] >= unix_s(f"{LAST_YEAR - 1}-12-31T23:59:59Z") + DURATION_S_MAX
 
 
 def test_an_epoch_is_brought_to_a_whole_millisecond_by_its_velocity():

@@ -13,8 +13,8 @@ from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 from madns_runtime.hardware.gnss_messages import GnssMessage
 
 BaudRate = Literal[4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600]
-UTC_S_MAX = 4_102_444_800.0
-"""The end of 2099."""
+UTC_S_MAX = 7_605_187_200.0
+"""The end of 2210: a run begins before 2200 and lasts ten years at most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
