@@ -186,6 +186,78 @@ def test_an_epoch_without_microseconds_is_read_and_one_with_a_zone_is_not(tmp_pa
     assert "EPOCH" in faults_of(path, CSV.replace("54.808992", "54.808992+02:00"))[0]
 
 
+NAMESPACE = "urn:ccsds:schema:ndmxml"
+PREFIXED = re.sub(r"<(/?)(?=\w)", r"<\1n:", XML).replace("<n:ndm", f'<n:ndm xmlns:n="{NAMESPACE}"')
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.csv", CSV.replace("2017-03-07T", "2017-066T")),
+        ("a.json", JSON.replace("2017-03-07T", "2017-066T")),
+        ("a.csv", CSV.replace("2017-03-07T", "2017-03-07 ")),
+        ("a.xml", XML.replace("<ndm", f'<ndm xmlns="{NAMESPACE}"', 1)),
+        ("a.xml", PREFIXED),
+        ("a.csv", "\n \n" + CSV),
+        ("a.txt", "\n" + CSV),
+        ("a.csv", CSV.replace(",", ", ")),
+        ("a.tle", TLE.replace("IRIDIUM", "#1 IRI")),
+    ],
+    ids=[
+        *("day of year csv", "day of year json", "blank for T", "default namespace", "prefix"),
+        *("empty lines", "empty line txt", "blanks", "name with a number sign"),
+    ],
+)
+def test_other_legal_forms_of_the_same_sets_are_read(tmp_path, name, text):
+    assert text != {"csv": CSV, "json": JSON, "xml": XML, "tle": TLE}.get(name[2:])
+    path = tmp_path / name
+    path.write_text(text)
+    plain = read_element_sets(DATA / f"iridium10.{name[2:].replace('txt', 'csv')}")
+
+    found = read_element_sets(path)
+
+    expected = [
+        s.name.replace("IRIDIUM", "#1 IRI" if name == "a.tle" else "IRIDIUM") for s in plain
+    ]
+    assert [s.name for s in found] == expected
+    assert [(s.lines, s.omm, s.epoch_utc) for s in found] == [
+        (s.lines, s.omm, s.epoch_utc) for s in plain
+    ]
+    assert len({s.place for s in found}) == len(plain)
+
+
+@pytest.mark.parametrize("date", ["2017-W10-2", "2017-000", "2017-366", "20170307", "0001-000"])
+def test_dates_that_ccsds_does_not_have_are_refused(tmp_path, date):
+    found = faults_of(tmp_path / "a.csv", CSV.replace("2017-03-07", date, 1))
+
+    assert found[0].startswith("2: EPOCH: expected such as 2017-03-07T07:18:55.000000 or 2017-066T")
+
+
+def test_faults_below_empty_lines_have_their_own_line(tmp_path):
+    lines = ("\n\n" + CSV.replace("86.4011", "polar", 1)).splitlines()
+
+    assert faults_of(tmp_path / "a.csv", "\n".join(lines))[0].startswith("5: INCLINATION")
+    lines[2] = lines[2].replace("BSTAR", "B*")
+    assert faults_of(tmp_path / "a.csv", "\n".join(lines))[0].startswith("3: expected the columns")
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a.kvn", "a.tle", "a.csv"])
+def test_kvn_is_called_kvn(tmp_path, name):
+    [fault] = faults_of(
+        tmp_path / name, "CCSDS_OMM_VERS = 2.0\nOBJECT_NAME = ISS\nORIGINATOR = X\n"
+    )
+
+    assert "OMM as KVN" in fault
+
+
+@pytest.mark.parametrize("comment", ["# 1 is old", "#", "#old", "#" + "1" * 24, "#1 SAT\n# one"])
+def test_comments_above_a_set_without_a_name_are_no_names(tmp_path, comment):
+    path = tmp_path / "a.tle"
+    path.write_text("\n".join((comment, *TLE.splitlines()[1:3])))
+
+    assert [s.name for s in read_element_sets(path)] == ["24792"]
+
+
 def test_six_digit_catalogue_numbers_are_flown(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(CSV.replace("24792", "799500100"))

@@ -15,6 +15,7 @@ from pathlib import Path
 from madns_runtime.errors import ConfigurationError, MissingExtraError
 from madns_runtime.plugin.api import DeviceUse, PlaceUse
 from madns_runtime.simulations.constellation.check_flight import flight_faults, rate_faults
+from madns_runtime.simulations.constellation.check_slots import node_faults, slot_record_faults
 from madns_runtime.simulations.constellation.check_vehicles import (
     board_faults,
     code_faults,
@@ -40,7 +41,7 @@ from madns_runtime.simulations.constellation.vehicle.truth_buffer import (
     KNOTS_HELD_MAX,
     SEGMENTS_MAX,
 )
-from madns_runtime.simulations.constellation.vehicles import DEFAULT, rules_with_even_slots
+from madns_runtime.simulations.constellation.vehicles import DEFAULT
 
 FIELD = "parameters.satellites.elements"
 AGE_DAYS_MAX = 366.0
@@ -83,6 +84,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
         pairs = list(zip(names, chosen.names, strict=False))
         faults += set_faults(parameters, chosen, duration_s)
         faults += field_year_remarks(parameters, chosen.epoch_utc)
+        faults += node_faults(parameters, chosen, names)
     except ConfigurationError as error:
         faults += str(error).splitlines()
     faults += _propagator_faults(parameters, folder)
@@ -92,7 +94,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
     faults += board_faults(parameters, pairs)
     faults += flight_faults(parameters, pairs, folder, is_lockstep=is_lockstep)
     faults += rate_faults(parameters, tick_hz)
-    faults += _slot_faults(parameters)
+    faults += slot_record_faults(parameters)
     faults += _late_uplinks(parameters, duration_s)
     faults += _idle_coefficients(parameters)
     if parameters.recorded_agents is not None and not is_lockstep:
@@ -201,31 +203,6 @@ def _idle_coefficients(parameters: ConstellationParameters) -> list[str]:
             for name in given[:1]
         ]
     return remarks
-
-
-def _slot_faults(parameters: ConstellationParameters) -> list[str]:
-    """Return why slot errors cannot be recorded."""
-    if parameters.record.slots_hz is None:
-        return []
-    rules = rules_with_even_slots(parameters)
-    if not rules:
-        return [
-            "parameters.record.slots_hz: expected flight software with settings {slots: even}, got none; "
-            "drop it, or let parameters.flight say so"
-        ]
-    spacings = [rule.settings.get("spacing_deg") for rule in rules]
-    for spacing in spacings:
-        if spacing is not None and type(spacing) not in (int, float):
-            return [
-                "parameters.record.slots_hz: expected a number of degrees as spacing_deg in settings with slots: even, "
-                f"got {spacing!r:.80}"
-            ]
-    if any(spacing != spacings[0] for spacing in spacings):
-        told = ", ".join(sorted({*map(str, spacings)}))
-        return [
-            f"parameters.record.slots_hz: expected one spacing_deg in all settings with slots: even, got {told}"
-        ]
-    return []
 
 
 def _segment_faults(parameters: ConstellationParameters) -> list[str]:
