@@ -19,6 +19,7 @@ from madns_runtime.recording.reader import read_stream
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.recording.stream_file import path_of
 from tests.hardware.driving import opened
 
 CHANNELS = [
@@ -121,6 +122,28 @@ def test_playback_gives_the_recorded_values_at_their_own_times_and_ages(tmp_path
     assert sorted(found) == sorted(told)
     handed_on = [t_s + age_us * 1e-6 for _, t_s, age_us, _ in found]
     assert handed_on == sorted(handed_on)
+
+
+def test_playback_goes_through_the_files_of_all_processes_that_the_device_had(tmp_path):
+    told = record(tmp_path, {"gyro": 0.0015, "level": 0.03})
+    for name in ("gyro", "level"):
+        head, *lines = (tmp_path / f"{name}.jsonl").read_text().splitlines(keepends=True)
+        for number, part in ((1, lines[:9]), (2, lines[9:60]), (10, lines[60:])):
+            path_of(tmp_path, name, number).write_text("".join([head, *part]))
+        path_of(tmp_path, name, 3).touch()  # of a process that was killed before it wrote
+    with opened("playback", tmp_path, directory=".") as device:
+        found = []
+        while (next_s := device.next_s()) != math.inf:
+            [(name, value)] = device.sample_at(next_s).values.items()
+            found.append((name, tuple(value) if isinstance(value, list) else (value,)))
+
+    for name in ("gyro", "level"):
+        values = [numbers for channel, _, _, numbers in told if channel == name]
+        assert [numbers for channel, numbers in found if channel == name] == values
+    schema = (tmp_path / "gyro.jsonl").read_text().splitlines()[0]
+    path_of(tmp_path, "level", 11).write_text(schema)
+    with pytest.raises(PluginError, match=r"level.11.jsonl: expected the fields of level.jsonl"):
+        prepare("playback", {"directory": "."}, tmp_path)
 
 
 def test_a_playback_recorded_anew_is_the_same_to_the_microsecond(tmp_path):
