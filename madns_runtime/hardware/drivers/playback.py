@@ -22,6 +22,8 @@ ROUNDING_S: Final = 1e-6
 class PlaybackDevice(SimulatedDevice):
     """Gives each recorded sample when it was handed on, with the time at which it was taken."""
 
+    is_finite = True  # all samples that one tick found are of its time
+
     def open(self) -> str:
         """Begin the recording."""
         found_at = _finder(self.parameters)
