@@ -23,6 +23,8 @@ from madns_runtime.plain_values import is_real
 
 FROZEN: Final = "frozen:"
 """Before an input's name: how often it stood still."""
+AGE_S_MAX: Final = 1e9
+"""Of a sample: 30 years, which no machine has been running for."""
 EVENTS_MAX: Final = 1000
 """Of one kind of event, such as refused values; more are counted alone."""
 
@@ -230,16 +232,16 @@ class Intake:
 
 def _check_times(sample: Sample, latest_s: float, now_s: float) -> None:
     """
-    Refuse a sample whose times are none, or still to come.
+    Refuse a sample whose times are none, still to come, or so long ago that its age has no room on record.
 
     Raises:
         PluginError: They are.
     """
     taken_s: Any = sample.taken_s
-    if not is_real(taken_s) or not math.isfinite(taken_s) or taken_s > latest_s:
+    if not is_real(taken_s) or not now_s - AGE_S_MAX <= taken_s <= latest_s:
         raise PluginError(
-            f"taken_s: expected a time until now, {now_s:.6f} s of time.monotonic() (in lockstep simulated), got"
-            f" {taken_s!r:.80}"
+            f"taken_s: expected a time until now, {now_s:.6f} s of time.monotonic() (in lockstep simulated), and at most"
+            f" {AGE_S_MAX:g} s before it, got {taken_s!r:.80}"
         )
     device_s: Any = sample.device_s
     if device_s is not None and not is_real(device_s):
