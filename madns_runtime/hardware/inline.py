@@ -62,7 +62,7 @@ class InlineDevice:
         self._account = StatusAccount()
         self._rate_hz = launch.rate_hz
         self._count = 0
-        self._progress = TimeProgress()
+        self._progress = TimeProgress(device)
         self._launch = launch
         self._why = ""
         """Words for what its driver raised at the end, or why it was lost before."""
