@@ -48,7 +48,8 @@ def run_devices(
     code = 1
     try:
         users = {end.fileno() for seat in seats for end in seat.users.values()}
-        leave_parent(keep={control.fileno(), *users})
+        claims = frozenset[int]().union(*(seat.claims for seat in seats))
+        leave_parent(keep={control.fileno(), *users, *claims})
         report = DeviceLoop(seats, control, config, directory).run()
         for part in messages.in_parts(REPORT, report):
             messages.send(control, part)

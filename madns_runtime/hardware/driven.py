@@ -56,8 +56,10 @@ class DrivenDevice:
     """Why it was lost the last time."""
 
     @classmethod
-    def share(cls, launch: DeviceLaunch, program: DeviceProgram) -> DrivenDevice:
-        """Make what a device and its users share; before anybody is forked."""
+    def share(
+        cls, launch: DeviceLaunch, program: DeviceProgram, claims: frozenset[int] = frozenset()
+    ) -> DrivenDevice:
+        """Make what a device and its users share, beside its claims' descriptors; before anybody is forked."""
         pairs = {agent: messages.make_pair() for agent in launch.users}
         seat = DeviceSeat(
             launch=launch,
@@ -65,6 +67,7 @@ class DrivenDevice:
             channels=program.channels,
             page=DevicePage([c for c in program.channels if c.direction == "in"]),
             users={agent: pair[1] for agent, pair in pairs.items()},
+            claims=claims,
         )
         return cls(
             seat=seat,

@@ -76,8 +76,8 @@ class DeviceManager:
         for each in launch.devices:
             tell(f"importing the kind of device {each.kind}")
             program = prepare(each.kind, each.parameters, Path(each.base_directory))
-            self._claims.claim(each, program.kind, program.needs.exclusive)
-            driven = DrivenDevice.share(each, program)
+            claims = self._claims.claim(each, program.kind, program.needs.exclusive)
+            driven = DrivenDevice.share(each, program, claims)
             self._devices[driven.name] = driven
             if program.kind.can_block:
                 self._processes.append(DeviceProcess([driven]))
