@@ -6,7 +6,7 @@ from typing import Final
 
 from madns_runtime.errors import PluginError
 
-CELLS_MAX: Final = 1024
+CELLS_MAX: Final = 1280
 """Names of one device: all that is counted of 64 channels, and of agents. What is counted under more is counted under REST."""
 NUMBER_MAX: Final = 1e15
 """Counted at once: whole numbers of a float64 reach further, and sums of them do."""
