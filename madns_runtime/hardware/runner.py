@@ -125,12 +125,9 @@ class DeviceRunner:
 
     def _fail(self, method: str, error: BaseException) -> None:
         """Note what a driver raised, close the device, and open it anew after a while."""
-        if isinstance(error, KeyboardInterrupt | GeneratorExit):
-            raise error
         name = type(self._device).__name__ if self._device is not None else self._launch.kind
-        self.tell_error(self._blame(name, method, error, self._device))
+        self._blame(name, method, error, self._device)
         self._failures += 1
-        self._header[page.ERRORS] += 1
         self._close_device()
         if not has_descriptors():
             self._give_up(f"{name} leaks descriptors: none is left, so it gets a process anew")
@@ -147,16 +144,18 @@ class DeviceRunner:
         if not self.gave_up and (leak := leak_of(self._first_bytes)):
             self._give_up(f"{type(self._device).__name__} {leak}, so it gets a process anew")
 
-    def _blame(self, driver: str, method: str, error: BaseException, device: Any) -> str:
-        """Record what a driver's method raised, and return its words."""
+    def _blame(self, driver: str, method: str, error: BaseException, device: Any) -> None:
+        """Record, count and tell what a driver's method raised; but what follows a fault is not told over that."""
         self._reactor.end_if_forked()  # by sys.exit, say: whoever forked it goes on
         called = getattr(device, method, None)
         text = driver_answers.describe_fault(error, f"{driver}.{method}", called)
         self._intake.event("error", monotonic(), why=text)
-        return text
+        self._header[page.ERRORS] += 1
+        if not (self._failures and method in ("close", "make_safe")):
+            self.tell_error(text)
 
     def _close_device(self) -> None:
-        """Make the device safe and close it; what either raises is recorded."""
+        """Make the device safe and close it, whatever either raises."""
         device, self._device = self._device, None
         if device is None:  # it could not even be made, or is closed already
             self._header[page.STATE] = page.CLOSED
