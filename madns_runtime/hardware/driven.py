@@ -195,6 +195,12 @@ class DeviceProcess:
         """Send it a message; False if it does not listen."""
         return self.control is not None and messages.send(self.control, message)
 
+    def note_exit(self, code: int) -> None:
+        """Blame it, when the run is over, for an end otherwise than in good order: not with 0, or without its report."""
+        for driven in self.devices:
+            if code or driven.report is None:
+                driven.blame(self.gave_up_why or exit_text(code))
+
     def has_words(self) -> bool:
         """Tell whether it has said something that nobody has heard, or has closed its end."""
         return self.control is not None and bool(ready([self.control.fileno()], [], 0)[0])

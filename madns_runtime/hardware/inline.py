@@ -20,6 +20,7 @@ from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.simulated import TimeProgress, next_of
 from madns_runtime.hardware.status import StatusAccount, limits_of
+from madns_runtime.plugin.code_places import error_text
 from madns_runtime.plugin.context import describe_exception
 
 RECORDS_TIMEOUT_S: Final = 10.0
@@ -245,7 +246,7 @@ class InlineDevice:
             if not isinstance(error.__cause__, PluginError):
                 raise
             self._outputs.note_refused(output)
-            why = f"{output.channel.name}: {error.__cause__}"
+            why = f"{output.channel.name}: {error_text(error.__cause__)}"
             self._intake.event("refused", now_s, why=why)
             return
         self._records.written(output.channel.name, output.due_s, now_s, output.told)

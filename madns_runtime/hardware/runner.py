@@ -22,6 +22,7 @@ from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.simulated import next_of, pass_over, samples_by_now
 from madns_runtime.hardware.status import LOST_PERIODS, back_off_s, limits_of, sample_period_s
+from madns_runtime.plugin.code_places import error_text
 from madns_runtime.reactor.reactor import Reactor
 
 BURST_MAX: Final = 256
@@ -320,7 +321,7 @@ class DeviceRunner:
         try:
             device.write({name: output.value}, output.due_s)
         except PluginError as error:
-            self._refuse(f"{name}: {error}", output)
+            self._refuse(f"{name}: {error_text(error)}", output)
             return True
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._outputs.note_lost(output)

@@ -231,6 +231,25 @@ def test_what_close_raises_is_counted_and_told_but_not_over_the_fault_before_it(
     assert told[1]["why"].startswith("Line.read raised ValueError: read does not work (line.py:")
 
 
+@pytest.mark.usefixtures("unhurried")
+@pytest.mark.parametrize(
+    ("ending", "why"),
+    [
+        ("os.kill(os.getpid(), signal.SIGKILL)", "killed by SIGKILL"),
+        ("os._exit(0)", "exit code 0"),
+    ],
+)
+def test_a_process_that_its_driver_ends_at_the_close_is_told_so(tmp_path, monkeypatch, ending, why):
+    monkeypatch.setattr(
+        bench_module, "DRIVER", bench_module.DRIVER.replace('self._raise("close")', ending)
+    )
+    with line_bench(tmp_path) as (bench, _):
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+        result = bench.close()["pi22/line"]
+
+    assert (result["why"], result["report"]["unreported"]) == (why, 1)
+
+
 def test_a_driver_that_fails_while_it_is_made_is_lost_as_one_that_does_not_open(tmp_path):
     made = "\n    def __init__(self, parameters):\n        raise OSError('no such bus')\n"
     (tmp_path / "made.py").write_text(bench_module.DRIVER + "\n\nclass Made(Line):" + made)
