@@ -17,6 +17,8 @@ CELL_BYTES: Final = NAME_BYTES + 8
 TABLE_BYTES: Final = CELLS_MAX * CELL_BYTES
 NOT_FINITE: Final = "_not_finite"
 """Behind an input's name: how often it was no number."""
+BEYOND_LIMITS: Final = "_beyond_limits"
+"""Behind an input's name: how often it was beyond its limits, and is handed on as it is."""
 MISSED: Final = "missed:"
 """Before an agent's name: how many messages were given up that it did not take."""
 
