@@ -56,8 +56,10 @@ class DrivenDevice:
     """Why it was lost the last time."""
 
     @classmethod
-    def share(cls, launch: DeviceLaunch, program: DeviceProgram) -> DrivenDevice:
-        """Make what a device and its users share; before anybody is forked."""
+    def share(
+        cls, launch: DeviceLaunch, program: DeviceProgram, claims: frozenset[int] = frozenset()
+    ) -> DrivenDevice:
+        """Make what a device and its users share, beside its claims' descriptors; before anybody is forked."""
         pairs = {agent: messages.make_pair() for agent in launch.users}
         seat = DeviceSeat(
             launch=launch,
@@ -65,6 +67,7 @@ class DrivenDevice:
             channels=program.channels,
             page=DevicePage([c for c in program.channels if c.direction == "in"]),
             users={agent: pair[1] for agent, pair in pairs.items()},
+            claims=claims,
         )
         return cls(
             seat=seat,
@@ -191,6 +194,12 @@ class DeviceProcess:
     def tell(self, message: list[Any]) -> bool:
         """Send it a message; False if it does not listen."""
         return self.control is not None and messages.send(self.control, message)
+
+    def note_exit(self, code: int) -> None:
+        """Blame it, when the run is over, for an end otherwise than in good order: not with 0, or without its report."""
+        for driven in self.devices:
+            if code or driven.report is None:
+                driven.blame(self.gave_up_why or exit_text(code))
 
     def has_words(self) -> bool:
         """Tell whether it has said something that nobody has heard, or has closed its end."""

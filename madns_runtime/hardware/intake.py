@@ -11,7 +11,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.hardware.contract import Channel, Device, Sample
-from madns_runtime.hardware.count_table import MISSED, NOT_FINITE
+from madns_runtime.hardware.count_table import BEYOND_LIMITS, MISSED, NOT_FINITE
 from madns_runtime.hardware.fault_actions import check_fault_fits
 from madns_runtime.hardware.faults import InsertedFaults
 from madns_runtime.hardware.page import DevicePage
@@ -184,7 +184,7 @@ class Intake:
                 continue
             is_told = True
             if channel.limits is not None and hold_to_limits(channel, numbers)[1]:
-                self.count(f"{name}_beyond_limits")
+                self.count(f"{name}{BEYOND_LIMITS}")
             number = self._page.write(name, sample.taken_s, device_s, numbers)
             if channel.passing == "queue":
                 self._send([messages.FRAME, name, number, sample.taken_s, list(numbers)])
