@@ -29,7 +29,7 @@ from cosmos_cli.errors import ExitCode, RunFailedError
 from cosmos_cli.evidence.completeness import HOST, ExpectedRecords, find_missing
 from cosmos_cli.evidence.devices import expected_devices, read_devices, recorded_files
 from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
-from cosmos_cli.evidence.manifest import build_manifest, pack_run
+from cosmos_cli.evidence.manifest import build_manifest, first_still_packed, pack_run
 from cosmos_cli.evidence.remarks import declared_streams, undeclared_remarks
 from cosmos_cli.evidence.run_directory import (
     RESERVE_BYTES,
@@ -78,6 +78,8 @@ class RunSummary:
     """run.json."""
     is_packed: bool = True
     """Whether the package holds all of this."""
+    kept_member: str = ""
+    """Name in an earlier package of a file that is no longer here as it was, for which that package was kept."""
 
     @property
     def exit_code(self) -> ExitCode:
@@ -147,10 +149,11 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
         changed.setdefault(name, fault)
     if earlier.fault:
         changed[run.manifest_json.name] = earlier.fault
+    gone = {*changed, *(path.relative_to(run.path).as_posix() for path in gathered.unread)}
     gathered = dataclasses.replace(
         gathered,
         faults=(*gathered.faults, *(f"{name}: {what}" for name, what in changed.items())),
-        was={name: earlier.entries[name] for name in changed if name in earlier.entries},
+        was={name: entry for name, entry in earlier.entries.items() if name in gone},
     )
     return _conclude(
         run,
@@ -319,6 +322,8 @@ def _conclude(
     _keep_result(run, evidence.result)
     summary = _write_summary(run, gathered, evidence)
     progress("packing", 0.0)
+    if member := first_still_packed(run, gathered.was):
+        return dataclasses.replace(summary, is_packed=False, kept_member=member)
     pack = partial(pack_run, run, _start_s(document), without=gathered.unread)
     packed = _attempt(evidence, run.bundle, pack)
     if packed is not evidence:

@@ -45,6 +45,18 @@ def test_collect_of_a_cut_off_run_ends_with_5_and_names_what_is_missing(made, ca
     assert made.run.bundle.exists()
 
 
+def test_collect_tells_how_records_come_back_from_a_package_that_it_keeps_for_them(made, capsys):
+    finish(made)
+    made.stream("agent-01", "ticks").write_bytes(b"")
+
+    assert app.run(["collect", "1"]) == 5
+
+    err = capsys.readouterr().err
+    member = f"{made.run.name}/agents/agent-01/ticks.jsonl"
+    assert f"tar -xf {made.run.bundle} -C {made.run.path} --strip-components=1 {member};" in err
+    assert "packed:" not in err
+
+
 def test_collect_as_json_prints_run_json_alone(made, capsys):
     finish(made)
 
