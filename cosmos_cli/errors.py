@@ -41,6 +41,10 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130
 
 
+FAILED_RUNS = (ExitCode.RUN_FAILED, ExitCode.MACHINES, ExitCode.INTERRUPTED)
+"""Exit codes of runs that went wrong, whatever their checks say."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
     """One thing wrong with what a person wrote, and where it stands."""

@@ -16,7 +16,7 @@ from cosmos_cli.diff.document import several_documents, to_document
 from cosmos_cli.diff.page import write_comparisons
 from cosmos_cli.diff.side import check_comparable, open_side
 from cosmos_cli.diff.terminal import count_figures, print_comparison
-from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.errors import FAILED_RUNS, ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.table_labels import run_labels
@@ -169,7 +169,7 @@ def _run_all(
     runs, code = [], ExitCode.OK
     for number, scenario in enumerate(scenarios, start=1):
         run, own = _run_one(scenario, console=console, root=root)
-        failed = own in (ExitCode.RUN_FAILED, ExitCode.MACHINES, ExitCode.INTERRUPTED)
+        failed = own in FAILED_RUNS
         if failed and number < len(scenarios):
             raise typer.Exit(int(own))
         runs.append(run)

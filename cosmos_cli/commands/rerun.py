@@ -13,7 +13,7 @@ from cosmos_cli.collect.finished_run import collected_document
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.diff.compare import Selection, compare
 from cosmos_cli.diff.side import open_side
-from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.errors import FAILED_RUNS, ExitCode, InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
@@ -42,8 +42,6 @@ from cosmos_cli.rerun.scenario import make_rerun
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from cosmos_cli.ui.progress import told_progress
 from cosmos_cli.view.factory import make_view
-
-FAILED = (ExitCode.RUN_FAILED, ExitCode.MACHINES, ExitCode.INTERRUPTED)
 
 
 def rerun(
@@ -115,7 +113,7 @@ def _fly(
     )
     assert not isinstance(summary, Detached)  # nobody asked for it
     console.say(summary.last_line)
-    if summary.exit_code in FAILED:
+    if summary.exit_code in FAILED_RUNS:
         raise typer.Exit(int(summary.exit_code))
     with told_progress(console, "rerun") as progress:
         after = open_side(summary.run, summary.run.name)

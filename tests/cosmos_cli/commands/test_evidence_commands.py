@@ -194,6 +194,21 @@ def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
     assert "cosmos collect 1" in capsys.readouterr().err
 
 
+def test_judge_of_a_run_that_failed_is_no_pass_and_names_what_ended_it(made, tmp_path, capsys):
+    finish_run(made.run, made.result(status="failed", who="host", reason="boom"), made.expected)
+    checks = tmp_path / "checks.yaml"
+    checks.write_text(
+        "name: some\nsimulation: counter\nagents: {count: 2, tick_hz: 10}\ntime: {duration_s: 20}\n"
+        "checks: [{name: some, stream: round_trips, statistic: count, above: 1}]\n"
+    )
+
+    code = app.run(["judge", "1", "-s", str(checks), "--json"])
+
+    document = json.loads(capsys.readouterr().out)
+    assert (code, document["exit_code"]) == (1, 1)
+    assert document["verdict"] == "FAILED: host: boom; judged by what it recorded: 1 check holds"
+
+
 @pytest.mark.parametrize("verb", ["report", "judge", "tabulate", "rerun", "diff"])
 def test_run_that_lives_is_to_be_waited_for_as_collecting_it_would_be_refused_too(
     made, capsys, monkeypatch, verb
