@@ -776,6 +776,33 @@ def test_a_run_that_ended_as_it_should_is_judged_by_the_expectations_alone(run_c
     assert conclusion_of_expectations([held], (), document) == (0, "PASSED: 1 check holds")
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"stream": "events", "field": "event", "event": "burn", "must": "not_occur"},
+        {"statistic": "count", "bounds": ValueBounds.below(5.0)},
+        {"statistic": "rate", "bounds": ValueBounds.below(5.0)},
+    ],
+)
+@pytest.mark.parametrize("from_s", [DURATION_S, 2 * DURATION_S])
+def test_no_record_is_no_answer_for_a_time_that_was_never_flown(asked, from_s):
+    (result,) = judge(expect(from_s=from_s, to_s=3 * DURATION_S, **asked)).results
+
+    assert (result.got, result.passed) == (None, False)
+    assert result.expected == f"x (the run ended at {DURATION_S:g} s, before its from_s)"
+
+
+def test_a_time_that_was_flown_in_part_is_judged_with_a_remark():
+    few = {"statistic": "count", "bounds": ValueBounds.below(1e9), "from_s": 20.0}
+
+    over = judge(expect(**few, to_s=2 * DURATION_S))
+    whole = judge(expect(**few, to_s=DURATION_S))
+
+    assert over.results[0].passed and whole.results[0].passed
+    assert over.remarks() == ("x: judged until 100 s, when the run ended, and not until 200 s",)
+    assert whole.remarks() == ()
+
+
 def test_what_comes_after_a_check_that_is_not_judged_is_not_judged_either():
     late = expect(name="late", stream="ticks", statistic="first_time", only_realtime=True)
     after = {"stream": "events", "field": "event", "event": "done"}
