@@ -24,7 +24,9 @@ from madns_runtime.partial_file import check_replaceable, write_whole
 
 SUITE: Final = "cosmos"
 START_BYTES_MAX: Final = 1000
-"""Of an earlier file, to tell whether it is XML."""
+"""Of an earlier file, to tell whether it is JUnit XML."""
+START: Final = b"<testsuite"
+"""Is in the first bytes of every such file: its root element, or the one below."""
 TEXT_CHARACTERS_MAX: Final = 20_000
 MESSAGE_CHARACTERS_MAX: Final = 1000
 
@@ -112,7 +114,7 @@ def prepare_junit(path: Path | None) -> None:
     Make the folders above the file and remove an earlier one, whose results would be taken for those that are to come.
 
     Raises:
-        InputError: It could not be written, or what is there is no XML, such as the scenario of who left FILE out.
+        InputError: It could not be written, or what is there is no JUnit XML, such as the scenario of who left FILE out.
     """
     if path is None:
         return
@@ -127,9 +129,9 @@ def prepare_junit(path: Path | None) -> None:
         if path.exists():
             with path.open("rb") as stream:
                 start = stream.read(START_BYTES_MAX).removeprefix(BOM_UTF8).lstrip()
-            if start and not start.startswith(b"<"):
+            if start and not (start.startswith(b"<") and START in start):
                 raise _unwritable(
-                    path, "what is there is no XML, and would be lost; name another file"
+                    path, "what is there is no JUnit XML, and would be lost; name another file"
                 )
             path.unlink()
     except OSError as error:
