@@ -25,7 +25,7 @@ from cosmos_cli.collect.finished_run import refuse_living
 from cosmos_cli.collect.machine_sources import RecordingMachines
 from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.unread_files import find_unread, told_unread
-from cosmos_cli.errors import ExitCode, RunFailedError
+from cosmos_cli.errors import FAILED_RUNS, ExitCode, RunFailedError
 from cosmos_cli.evidence.completeness import HOST, ExpectedRecords, find_missing
 from cosmos_cli.evidence.devices import expected_devices, read_devices, recorded_files
 from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
@@ -95,6 +95,16 @@ class RunSummary:
     def last_line(self) -> str:
         """The verdict, and where the evidence lies."""
         return f"{self.verdict.text} | {self.run.path}"
+
+    def refuse_failed(self) -> None:
+        """
+        See that it can be worked with: it did not fail, lose a machine or end by an interruption.
+
+        Raises:
+            RunFailedError: It did; with its exit code.
+        """
+        if self.exit_code in FAILED_RUNS:
+            raise RunFailedError(self.last_line, exit_code=self.exit_code, run=self.run.path)
 
 
 def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five are optional and by name

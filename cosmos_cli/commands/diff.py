@@ -16,7 +16,7 @@ from cosmos_cli.diff.document import several_documents, to_document
 from cosmos_cli.diff.page import write_comparisons
 from cosmos_cli.diff.side import check_comparable, open_side
 from cosmos_cli.diff.terminal import count_figures, print_comparison
-from cosmos_cli.errors import FAILED_RUNS, ExitCode, InputError
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import RunDirectory, runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.evidence.table_labels import run_labels
@@ -76,7 +76,8 @@ def diff(
     """
     Compare runs with the first: settings, timing, and record by record what their simulation recorded.
 
-    Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ.
+    Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ; with --run, as a run
+    that went wrong: 1 failed, 3 machines failed, 4 budget or check broken, 5 data incomplete, 130 interrupted.
     """
     instead = "the exit code tells what was found" if expect_same or run_first else None
     console = Console(json=as_json, quiet=quiet, instead=instead)
@@ -164,25 +165,22 @@ def _load_all(
 def _run_all(
     scenarios: Sequence[ScenarioFile], console: Console, folder: Path | None
 ) -> tuple[list[RunDirectory], ExitCode]:
-    """Run scenarios one after the other; after one that failed, no further one."""
+    """
+    Run scenarios one after the other.
+
+    Raises:
+        RunFailedError: One but the last failed: no further one is run.
+    """
     root = runs_root(folder)
     runs, code = [], ExitCode.OK
     for number, scenario in enumerate(scenarios, start=1):
-        run, own = _run_one(scenario, console=console, root=root)
-        failed = own in FAILED_RUNS
-        if failed and number < len(scenarios):
-            raise typer.Exit(int(own))
-        runs.append(run)
-        code = own if code is ExitCode.OK else code
+        summary = execute(
+            scenario, RunOptions(runs=root), partial(make_view, quiet=console.quiet), console.say
+        )
+        assert not isinstance(summary, Detached)  # nobody asked for it
+        if number < len(scenarios):
+            summary.refuse_failed()
+        console.say(summary.last_line)
+        runs.append(summary.run)
+        code = summary.exit_code if code is ExitCode.OK else code
     return runs, code
-
-
-def _run_one(
-    scenario: ScenarioFile, *, console: Console, root: Path
-) -> tuple[RunDirectory, ExitCode]:
-    summary = execute(
-        scenario, RunOptions(runs=root), partial(make_view, quiet=console.quiet), console.say
-    )
-    assert not isinstance(summary, Detached)  # nobody asked for it
-    console.say(summary.last_line)
-    return summary.run, summary.exit_code

@@ -13,7 +13,7 @@ from cosmos_cli.collect.finished_run import collected_document
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.diff.compare import Selection, compare
 from cosmos_cli.diff.side import open_side
-from cosmos_cli.errors import FAILED_RUNS, ExitCode, InputError
+from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.evidence.run_directory import runs_root
 from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
@@ -68,7 +68,7 @@ def rerun(
     Fly a recorded run again without its hardware: in lockstep, each device played back from its records.
 
     Its checks are judged on the rerun too, and its timeline takes place again. Today's software flies where it can be stepped, and what of it differs from what was flown is named. Ends with 0 when all that is compared is the same, with 1 when
-    something differs, with 2 when the run cannot be flown again.
+    something differs, with 2 when the run cannot be flown again; with 1, 3 (a machine) or 130 (interrupted) and an error when the rerun itself fails.
     """
     if as_recorded and as_recorded_from is not None:
         raise InputError("--as-recorded and --as-recorded-from DIR: give one of them")
@@ -112,9 +112,8 @@ def _fly(
         console.say,
     )
     assert not isinstance(summary, Detached)  # nobody asked for it
+    summary.refuse_failed()
     console.say(summary.last_line)
-    if summary.exit_code in FAILED_RUNS:
-        raise typer.Exit(int(summary.exit_code))
     with told_progress(console, "rerun") as progress:
         after = open_side(summary.run, summary.run.name)
         streams = compare(before, after, Selection(), progress)
