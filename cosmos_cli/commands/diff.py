@@ -23,7 +23,7 @@ from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.models.overrides import told_as_options
-from cosmos_cli.system.named_file import check_writable, named_file
+from cosmos_cli.system.named_file import HTML, check_writable, named_file
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.plural import counted
 from cosmos_cli.ui.progress import told_progress
@@ -85,7 +85,7 @@ def diff(
     names = [a, *others]
     chosen = Selection(agents=tuple(agents or ()), streams=tuple(streams or ()))
     if html is not None:
-        check_writable(html)
+        check_writable(html, HTML)
     if len(names) > RUNS_MAX:
         raise InputError(f"expected at most {RUNS_MAX} runs, got {len(names)}")
     if run_first:
