@@ -76,8 +76,7 @@ def diff(
     """
     Compare runs with the first: settings, timing, and record by record what their simulation recorded.
 
-    Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ; with --run, as a run
-    that went wrong: 1 failed, 3 machines failed, 4 budget or check broken, 5 data incomplete, 130 interrupted.
+    Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ; with --run, as a run that went wrong.
     """
     instead = "the exit code tells what was found" if expect_same or run_first else None
     console = Console(json=as_json, quiet=quiet, instead=instead)

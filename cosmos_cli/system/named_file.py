@@ -20,11 +20,11 @@ START_BYTES_MAX: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class FileKind:
-    """What a command writes into a file that was named."""
+    """Kind of file that a command writes where a person named one."""
 
     name: str
     begins: re.Pattern[bytes]
-    """Is found in the beginning of every such file, at its start."""
+    """Matches the start of every such file."""
 
 
 HTML: Final = FileKind("HTML", re.compile(rb"\s*<(!doctype html|html)", re.IGNORECASE))
