@@ -36,7 +36,7 @@ from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.device_sampling import missing_for
-from cosmos_cli.launch.plan import make_plan
+from cosmos_cli.launch.plan import LaunchPlan, make_plan
 from cosmos_cli.launch.plan_view import LATENCY_MS_UNKNOWN, feasibility_of, resources_of
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.devices import driven_devices
@@ -166,8 +166,9 @@ class _Examination:
             None if scenario is None else load_scenario(scenario, overrides, warn=console.warn)
         )
         self._needs = DoctorNeeds(machines, self._scenario_file)
+        self._plan = _plan_of(self._scenario_file, machines)
         count = len(self._fleet.targets) if self._fleet else 0
-        self.wants = _wants(self._scenario_file, machines, count)
+        self.wants = _wants(self._scenario_file, self._plan, machines, count)
 
     def outcomes(self) -> list[Outcome[Told]]:
         """Return what every machine told, this computer first."""
@@ -220,7 +221,7 @@ class _Examination:
 
     def _feasibility(self, outcomes: Sequence[Outcome[Told]]) -> dict[str, Any] | None:
         """Hold the four inequalities against the network as it was measured; None without a demand."""
-        if self._scenario_file is None:
+        if self._scenario_file is None or self._plan is None:
             return None
 
         trips_ms = [
@@ -233,7 +234,7 @@ class _Examination:
         given_ms = self._scenario_file.scenario.plan.latency_ms
         unknown_s = (LATENCY_MS_UNKNOWN if given_ms is None else given_ms) / 1e3
         latency_s = max(trips_ms) / 2e3 if trips_ms else unknown_s
-        resources = resources_of(self._scenario_file, latency_s)
+        resources = resources_of(self._scenario_file, self._plan, latency_s)
         found = feasibility_of(self._scenario_file, resources)
         return None if found is None else found.to_mapping()
 
@@ -256,14 +257,22 @@ def _devices(machines: Sequence[Machine]) -> list[dict[str, Any]]:
     ]
 
 
-def _wants(file: ScenarioFile | None, machines: Sequence[Machine], count: int) -> Wants:
-    """Return what a scenario asks for of these machines, *count* of which are others than this computer."""
-    affinity = _affinity(machines, file)
+def _plan_of(file: ScenarioFile | None, machines: Sequence[Machine]) -> LaunchPlan | None:
+    """Return who would run where; None without a scenario."""
     if file is None:
-        return Wants(machines=count, affinity=affinity)
-    plan = make_plan(
+        return None
+    return make_plan(
         file.scenario, machines or (LOOPBACK,), fault_at=file.fault, labels=file.labels
     )
+
+
+def _wants(
+    file: ScenarioFile | None, plan: LaunchPlan | None, machines: Sequence[Machine], count: int
+) -> Wants:
+    """Return what a scenario asks for of these machines, *count* of which are others than this computer."""
+    affinity = _affinity(machines, file)
+    if file is None or plan is None:
+        return Wants(machines=count, affinity=affinity)
     agents: Counter[str] = Counter()
     for planned in plan.machines:
         name = HERE if planned.machine.connection == "local" else planned.name

@@ -99,7 +99,7 @@ def plan(
     latency_s, latency_source = latency_of(
         launch_plan, given_ms=given.latency_ms if latency_ms is None else latency_ms
     )
-    offered = resources_of(scenario_file, latency_s)
+    offered = resources_of(scenario_file, launch_plan, latency_s)
     resources = dataclasses.replace(
         offered,
         workers=workers or offered.workers,

@@ -26,6 +26,7 @@ from cosmos_cli.models.planning import Planning
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import DeviceLaunch
+from madns_runtime.lockstep.partition import processors_here
 from madns_runtime.plugin.api import Demand, Flow
 
 LATENCY_MS_UNKNOWN = 0.5
@@ -86,15 +87,20 @@ def demand_of(scenario_file: ScenarioFile) -> Demand | None:
     return given.applied_to(demand)
 
 
-def resources_of(scenario_file: ScenarioFile, latency_s: float) -> Resources:
+def resources_of(
+    scenario_file: ScenarioFile, launch_plan: LaunchPlan, latency_s: float
+) -> Resources:
     """Return what host and network offer by the scenario, over a link of BANDWIDTH_MBIT_DEFAULT if it names none."""
     scenario, given = scenario_file.scenario, scenario_file.scenario.plan
+    host = launch_plan.host
+    is_here = (host is None or host.connection == "local") and not scenario.executor.address
     return Resources(
         workers=given.workers or scenario.executor.workers,
         bandwidth_bytes_s=(given.bandwidth_mbit or BANDWIDTH_MBIT_DEFAULT) * 1e6 / BITS_PER_BYTE,
         latency_s=latency_s,
         maneuvers_at_once=given.maneuvers_at_once,
         has_headers=given.has_headers,
+        processors=processors_here() if is_here else None,
     )
 
 
@@ -226,8 +232,13 @@ def show_feasibility(  # noqa: PLR0913 - what is printed, and two more by name
     console.data("")
     console.table(INEQUALITIES, [_row(item) for item in feasibility.inequalities])
     compute = "measured here" if feasibility.measured else "declared"
+    fewer = (
+        f" (of {resources.workers} workers: no more run at once on {counted(feasibility.workers, 'processor')})"
+        if feasibility.workers < resources.workers
+        else ""
+    )
     console.data(
-        f"N_p = {resources.workers}, T_n = {resources.latency_s * 1e3:.3g} ms ({latency_source}), "
+        f"N_p = {feasibility.workers}{fewer}, T_n = {resources.latency_s * 1e3:.3g} ms ({latency_source}), "
         f"B_n = {resources.bandwidth_bytes_s * BITS_PER_BYTE / 1e6:g} Mbit/s, compute times {compute}"
     )
     console.data(verdict_words(feasibility, capacity))

@@ -249,7 +249,7 @@ def pace_of(rehearsal: Rehearsal, outcomes: Sequence[Outcome[MachineRehearsal]])
     else:
         given_ms = rehearsal.scenario.scenario.plan.latency_ms
         latency_s, source = latency_of(rehearsal.plan, given_ms=given_ms)
-    resources = resources_of(rehearsal.scenario, latency_s)
+    resources = resources_of(rehearsal.scenario, rehearsal.plan, latency_s)
     feasibility, unknown = None, ""
     if not rehearsal.plan.is_lockstep:
         try:
