@@ -37,7 +37,7 @@ from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
 from cosmos_cli.launch.device_sampling import missing_for
 from cosmos_cli.launch.plan import LaunchPlan, make_plan
-from cosmos_cli.launch.plan_view import LATENCY_MS_UNKNOWN, feasibility_of, resources_of
+from cosmos_cli.launch.plan_view import feasibility_of, latency_of, resources_of
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.devices import driven_devices
 from cosmos_cli.models.inventory.machine import LOOPBACK
@@ -220,8 +220,8 @@ class _Examination:
         return for_each([target], task)[0]
 
     def _feasibility(self, outcomes: Sequence[Outcome[Told]]) -> dict[str, Any] | None:
-        """Hold the four inequalities against the network as it was measured; None without a demand."""
-        if self._scenario_file is None or self._plan is None:
+        """Hold the four inequalities against the network as it was measured; None in lockstep, and without a demand."""
+        if self._scenario_file is None or self._plan is None or self._plan.is_lockstep:
             return None
 
         trips_ms = [
@@ -231,9 +231,11 @@ class _Examination:
             and (trip := outcome.value["round_trips"])
             and trip.get("p50_ms") is not None
         ]
-        given_ms = self._scenario_file.scenario.plan.latency_ms
-        unknown_s = (LATENCY_MS_UNKNOWN if given_ms is None else given_ms) / 1e3
-        latency_s = max(trips_ms) / 2e3 if trips_ms else unknown_s
+        if trips_ms:
+            latency_s = max(trips_ms) / 2e3
+        else:
+            given_ms = self._scenario_file.scenario.plan.latency_ms
+            latency_s, _ = latency_of(self._plan, given_ms=given_ms)
         resources = resources_of(self._scenario_file, self._plan, latency_s)
         found = feasibility_of(self._scenario_file, resources)
         return None if found is None else found.to_mapping()

@@ -202,6 +202,46 @@ def test_wants_are_the_scenarios(
     assert any("2 agents at 20 Hz" in f["found"] for f in machine["findings"])
 
 
+@pytest.fixture
+def quick_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A counter on this computer that keeps 2000 Hz by a datagram's time on loopback, and would not by a switch's."""
+    monkeypatch.setattr("cosmos_cli.launch.plan_view.measure_loopback_s", lambda: 1e-5)
+    path = tmp_path / "quick.yaml"
+    path.write_text("name: quick\nsimulation: counter\nagents: {count: 3, tick_hz: 2000}\n")
+    return str(path)
+
+
+def findings_of(check: str, answer: dict[str, Any]) -> list[dict[str, Any]]:
+    return [each for each in answer["machines"][0]["findings"] if each["check"] == check]
+
+
+def test_inequalities_of_a_run_on_this_computer_are_those_of_its_plan(
+    told: Callable[..., None], quick_scenario: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan_code = cosmos(["plan", quick_scenario, "--json"])
+    planned = json.loads(capsys.readouterr().out)["feasibility"]
+    code = cosmos(["doctor", quick_scenario, "--json"])
+    answer = json.loads(capsys.readouterr().out)
+
+    assert (plan_code, code) == (0, 0)
+    assert answer["machines"][0]["probed"]["here"]["feasibility"] == planned
+    assert [each["level"] for each in findings_of("feasibility", answer)] == ["ok"]
+
+
+def test_lockstep_is_not_held_against_real_time(
+    told: Callable[..., None], quick_scenario: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = ["--set", "plan.latency_ms=5", "--json"]
+
+    real_time = cosmos(["doctor", quick_scenario, *broken])
+    capsys.readouterr()
+    lockstep = cosmos(["doctor", quick_scenario, *broken, "--set", "time.mode=lockstep"])
+    answer = json.loads(capsys.readouterr().out)
+
+    assert (real_time, lockstep) == (1, 0)
+    assert findings_of("feasibility", answer) == []
+
+
 def test_processors_that_a_machine_has_not_are_told_whoever_asks_for_them(
     told: Callable[..., None],
     inventory: Path,
