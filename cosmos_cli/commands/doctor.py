@@ -21,7 +21,7 @@ from cosmos_cli.commands.fleet_command import (
     SomeInventoryOption,
     failure_teller,
 )
-from cosmos_cli.doctor.case import Case, Wants
+from cosmos_cli.doctor.case import AgentBound, Case, Wants
 from cosmos_cli.doctor.finding import HERE, Finding, Severity, grouped
 from cosmos_cli.doctor.here import interface_of, look_here
 from cosmos_cli.doctor.judge import judge
@@ -35,17 +35,20 @@ from cosmos_cli.fleet.outcome import Outcome, failed
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.launch.capacity import ComputerFacts, processor_limits
 from cosmos_cli.launch.device_sampling import missing_for
 from cosmos_cli.launch.plan import LaunchPlan, make_plan
-from cosmos_cli.launch.plan_view import feasibility_of, latency_of, resources_of
+from cosmos_cli.launch.plan_view import demand_of, feasibility_of, latency_of, resources_of
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.devices import driven_devices
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.models.planning import NOTHING
 from cosmos_cli.ui import invocation
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.plural import counted
+from madns_runtime.plugin.api import Demand
 from madns_runtime.processes import state_directory
 
 FORKS_DEFAULT = 100
@@ -168,10 +171,11 @@ class _Examination:
         self._needs = DoctorNeeds(machines, self._scenario_file)
         self._plan = _plan_of(self._scenario_file, machines)
         count = len(self._fleet.targets) if self._fleet else 0
+        self._demand: Demand | None = None
         self.wants = _wants(self._scenario_file, self._plan, machines, count)
 
     def outcomes(self) -> list[Outcome[Told]]:
-        """Return what every machine told, this computer first."""
+        """Return what every machine told, this computer first, and learn what their processors bear."""
         outcomes: list[Outcome[Told]] = []
         own_addresses: set[str] = set()
         if self._fleet and self._fleet.targets:
@@ -193,7 +197,9 @@ class _Examination:
                     )
 
                 outcomes = self._fleet.each(task, failure_teller(self._console))
-        return [self._ask_here(own_addresses, outcomes), *outcomes]
+        outcomes = [self._ask_here(own_addresses, outcomes), *outcomes]
+        self.wants = dataclasses.replace(self.wants, bounds=self._bounds(outcomes))
+        return outcomes
 
     def _ask_here(
         self, own_addresses: set[str], outcomes: Sequence[Outcome[Told]]
@@ -224,6 +230,10 @@ class _Examination:
         if self._scenario_file is None or self._plan is None or self._plan.is_lockstep:
             return None
 
+        self._demand = demand_of(self._scenario_file)
+        if self._demand is None:
+            return None
+
         trips_ms = [
             trip["p50_ms"]
             for outcome in outcomes
@@ -237,8 +247,29 @@ class _Examination:
             given_ms = self._scenario_file.scenario.plan.latency_ms
             latency_s, _ = latency_of(self._plan, given_ms=given_ms)
         resources = resources_of(self._scenario_file, self._plan, latency_s)
-        found = feasibility_of(self._scenario_file, resources)
+        found = feasibility_of(self._scenario_file, resources, self._demand)
         return None if found is None else found.to_mapping()
+
+    def _bounds(self, outcomes: Sequence[Outcome[Told]]) -> dict[str, AgentBound]:
+        """Return how many agents each machine's processors are predicted to bear in real time; this computer is the host."""
+        if self._scenario_file is None or self._plan is None or self._plan.is_lockstep:
+            return {}
+
+        bounds: dict[str, AgentBound] = {}
+        for outcome in outcomes:
+            processors = outcome.value and outcome.value["limits"].get("usable_processors")
+            if not processors:
+                continue
+            name = outcome.machine
+            computer = ComputerFacts(name=name, processors=processors, is_host=name == HERE)
+            one_process, whole = processor_limits(
+                self._scenario_file.scenario, self._demand or NOTHING, computer
+            )
+            bounds[name] = AgentBound(
+                agents=min(one_process.agents, whole.agents),
+                is_of_process=one_process.agents < whole.agents,
+            )
+        return bounds
 
 
 def _devices(machines: Sequence[Machine]) -> list[dict[str, Any]]:

@@ -145,6 +145,16 @@ def predict_capacity(  # noqa: PLR0913 - all but four by name
     return Capacity(tick_hz=tick_hz, limits=tuple(limits))
 
 
+def processor_limits(
+    scenario: Scenario, demand: Demand, computer: ComputerFacts
+) -> tuple[Limit, Limit]:
+    """Return what the agents of one computer are limited to: by the thread of one process, and by all its processors."""
+    agents = scenario.agents
+    costs, workers = TickCosts(), scenario.executor.workers
+    load = _ProcessorLoad(costs, demand, agents.tick_hz, agents.per_process, [computer], workers)
+    return load.one_process(), load.whole(computer)
+
+
 @dataclass(frozen=True, slots=True)
 class _ProcessorLoad:
     costs: TickCosts

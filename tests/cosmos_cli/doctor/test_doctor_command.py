@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from cosmos_cli.app import run as cosmos
+from cosmos_cli.commands import doctor as command
 from cosmos_cli.commands.doctor import with_machines
 from cosmos_cli.doctor.finding import HERE, CheckRemark, Finding
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
@@ -83,8 +84,6 @@ def inventory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def told(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Let machines tell something else, so that nothing depends on this computer's state."""
-    import cosmos_cli.commands.doctor as command
-
     ask, ask_here = command.ask, command.ask_here
     other: dict[str, dict[str, Any]] = {}
 
@@ -240,6 +239,48 @@ def test_lockstep_is_not_held_against_real_time(
 
     assert (real_time, lockstep) == (1, 0)
     assert findings_of("feasibility", answer) == []
+
+
+@pytest.mark.parametrize(
+    ("agents", "level"),
+    [
+        ("{count: 62, tick_hz: 100}", "ok"),
+        ("{count: 80, tick_hz: 100}", "warning"),  # up to 62 by the plan; 54 and 66 were found
+        ("{count: 93, tick_hz: 100, per_process: 47}", "ok"),  # as measured, with none missed
+        ("{count: 93, tick_hz: 100, per_process: 93}", "ok"),
+        ("{count: 93, tick_hz: 200, per_process: 93}", "warning"),  # one thread
+    ],
+)
+def test_agents_are_held_against_the_processors_as_a_plan_does(
+    told: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    agents: str,
+    level: str,
+) -> None:
+    ask_here = command.ask_here
+
+    def on_two(*arguments: Any, **options: Any) -> dict[str, Any]:
+        values = ask_here(*arguments, **options)
+        values["limits"]["usable_processors"] = 2
+        return values
+
+    monkeypatch.setattr(command, "ask_here", on_two)
+    monkeypatch.setattr("cosmos_cli.launch.capacity_view.processors_here", lambda: 2)
+    path = tmp_path / "many.yaml"
+    path.write_text(f"name: many\nsimulation: counter\nagents: {agents}\n")
+
+    cosmos(["plan", str(path), "--latency-ms", "0.01", "--json"])
+    capacity = json.loads(capsys.readouterr().out)["capacity"]
+    cosmos(["doctor", str(path), "--json"])
+    (finding,) = findings_of("processors", json.loads(capsys.readouterr().out))
+
+    most = {each["name"]: each["agents"] for each in capacity["limits"]}
+    count = int(agents.partition(",")[0].removeprefix("{count: "))
+    names = ("process of agents", "processors of this computer")
+    is_planned = all(most[name] is None or count <= most[name] for name in names)
+    assert (finding["level"], is_planned) == (level, level == "ok")
 
 
 def test_processors_that_a_machine_has_not_are_told_whoever_asks_for_them(
