@@ -304,9 +304,7 @@ def _first_too_busy(sendings: Sequence[Sending], bandwidth_bytes_s: float) -> fl
 
 def wire_bytes(message_bytes: int) -> int:
     """Return the bytes that a message of so many encoded bytes costs on the wire, all headers included."""
-    if message_bytes <= 0:
-        return 0
-    datagrams = math.ceil(message_bytes / FRAGMENT_BYTES_MAX)
+    datagrams = max(1, math.ceil(message_bytes / FRAGMENT_BYTES_MAX))
     return message_bytes + datagrams * (DATAGRAM_OVERHEAD_BYTES + IP_UDP_BYTES)
 
 

@@ -212,11 +212,19 @@ def test_latency_beyond_the_buffer_breaks_at_the_first_agent():
 
 def test_wire_bytes_add_headers_for_every_datagram():
     assert [wire_bytes(size) for size in (0, 1, FRAGMENT_BYTES_MAX, FRAGMENT_BYTES_MAX + 1)] == [
-        0,
+        HEADERS,
         1 + HEADERS,
         1400 + 28,
         FRAGMENT_BYTES_MAX + 1 + 2 * HEADERS,
     ]
+
+
+def test_empty_messages_have_headers_to_carry():
+    empty = (Flow(name="empty", message_bytes=0, rate_hz=10_000),)
+
+    item = inequality("2.10", agents=3, asked=demand(**WITHOUT, flows=empty))
+
+    assert item.left == pytest.approx(3 * 10_000 * HEADERS)
 
 
 def test_infinity_becomes_null():
