@@ -201,7 +201,7 @@ def demand_mapping(demand: Demand, resources: Resources) -> dict[str, Any]:
             "name": each.name,
             "wire_bytes": each.wire_bytes,
             "rate_hz": each.rate_hz,
-            "within_s": each.within_s,
+            "within_s": finite(each.within_s),
             "senders_max": finite(each.senders_max),
         }
         for each in sendings_of(demand, resources)
