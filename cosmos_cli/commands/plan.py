@@ -26,6 +26,7 @@ from cosmos_cli.launch.place_plan import check_places
 from cosmos_cli.launch.plan import LaunchPlan, make_plan
 from cosmos_cli.launch.plan_view import (
     LOCKSTEP_WORDS,
+    buffer_words,
     demand_mapping,
     demand_of,
     feasibility_of,
@@ -109,6 +110,8 @@ def plan(
         else bandwidth_mbit * 1e6 / BITS_PER_BYTE,
     )
     outlook = _Outlook.of(scenario_file, launch_plan, resources, latency_source)
+    if outlook.demand is not None and (words := buffer_words(given, outlook.demand)):
+        console.warn(words)
     devices = list(itertools.chain(*plan_devices(scenario_file, launch_plan).values()))
     _show(console, launch_plan, devices, outlook, missing=given.missing)
     if outlook.feasibility and not outlook.feasibility.holds:

@@ -189,6 +189,16 @@ def show_flows(console: Console, demand: Demand, resources: Resources) -> None:
         console.data("; ".join(text for text in (told, told_s) if text))
 
 
+def buffer_words(given: Planning, demand: Demand) -> str | None:
+    """Say that a given S_a holds no batch; None if it does, or none is given: a simulation's own fits its batches."""
+    if not given.buffer_bytes or demand.batch_bytes <= given.buffer_bytes:
+        return None
+    return (
+        f"plan.buffer_bytes: a buffer of {given.buffer_bytes:,} B (S_a) does not hold a batch of {demand.batch_bytes:,} B (S_b),"
+        f" so that no agent can go on for T_bi = {demand.buffer_s:g} s; correct buffer_bytes, or batch_bytes and buffer_s"
+    )
+
+
 def demand_mapping(demand: Demand, resources: Resources) -> dict[str, Any]:
     """Return a demand as plain values, its flows as they travel and maneuvers among them; null stands for infinity."""
     figures = {

@@ -75,6 +75,15 @@ def test_agents_whose_workers_cannot_follow_are_not_said_to_keep_real_time(capsy
     )
 
 
+@pytest.mark.parametrize(("buffer_bytes", "is_warned"), [(48, True), (4799, True), (4800, False)])
+def test_a_buffer_that_holds_no_batch_is_warned_of(buffer_bytes, is_warned, capsys):
+    with pytest.raises(SystemExit):
+        main(["plan", str(SCENARIOS / CORRECTED), "--set", f"plan.buffer_bytes={buffer_bytes}"])
+
+    err = capsys.readouterr().err
+    assert ("does not hold a batch of 4,800 B (S_b)" in err) == is_warned
+
+
 @pytest.mark.process
 def test_1000_satellites_of_starlink_keep_real_time(capsys):
     with pytest.raises(SystemExit) as ended:
