@@ -198,10 +198,12 @@ class _ProcessorLoad:
     def all_workers(self) -> Limit:
         """Return the limit of the host's workers: all batches, and maneuvers at their rate over a long time."""
         each = self.truth_s(1) / self.host.speed
+        maneuvers_hz = self.demand.sync_rate_hz
+        what = f"batches and {maneuvers_hz:.3g} maneuvers a second" if maneuvers_hz else "batches"
         return Limit(
             name="host's workers",
             agents=_largest(lambda agents: is_within(agents * each, self.workers)),
-            why=f"{each:.2g} of a worker per agent, maneuvers at {self.demand.sync_rate_hz:.3g} Hz each, N_p = {self.workers}",
+            why=f"{each:.2g} of a worker per agent for {what}, N_p = {self.workers}",
         )
 
     def one_process(self) -> Limit:

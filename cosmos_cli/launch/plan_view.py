@@ -241,7 +241,7 @@ def show_feasibility(  # noqa: PLR0913 - what is printed, and two more by name
         return
     console.data("")
     console.table(INEQUALITIES, [_row(item) for item in feasibility.inequalities])
-    compute = "measured here" if feasibility.measured else "declared"
+    compute = _compute_words(feasibility)
     fewer = (
         f" (of {resources.workers} workers: no more run at once on {counted(feasibility.workers, 'processor')})"
         if feasibility.workers < resources.workers
@@ -252,6 +252,15 @@ def show_feasibility(  # noqa: PLR0913 - what is printed, and two more by name
         f"B_n = {resources.bandwidth_bytes_s * BITS_PER_BYTE / 1e6:g} Mbit/s, compute times {compute}"
     )
     console.data(verdict_words(feasibility, capacity))
+
+
+def _compute_words(feasibility: Feasibility) -> str:
+    """Say where compute times are from, and T_p(S_b) of how many agents at once: it is less of each of more."""
+    if not feasibility.measured:
+        return "declared"
+    has_batches = any(item.number == "2.7" and item.applies for item in feasibility.inequalities)
+    of = f", T_p(S_b) with {counted(feasibility.agents, 'agent')} at once" if has_batches else ""
+    return f"measured here{of}"
 
 
 def verdict_words(feasibility: Feasibility, capacity: Capacity | None = None) -> str:
