@@ -264,7 +264,7 @@ def _compute_words(feasibility: Feasibility) -> str:
 
 
 def verdict_words(feasibility: Feasibility, capacity: Capacity | None = None) -> str:
-    """Say whether the agents keep real time, and what limits their number; *capacity* is the prediction that stands above."""
+    """Say whether the agents keep real time, and what limits their number; *capacity* is the prediction, if there is one."""
     agents, binding = counted(feasibility.agents, "agent"), feasibility.binding
     if not feasibility.holds:
         return f"{agents} cannot keep real time: {broken_words(feasibility)}"
