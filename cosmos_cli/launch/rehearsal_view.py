@@ -217,7 +217,7 @@ class RehearsedPace:
     feasibility: Feasibility | None = None
     """None in lockstep, and where it is not known."""
     capacity: Capacity | None = None
-    """What is predicted of processors and buffers besides; None where there is no feasibility."""
+    """Prediction of processors and buffers as well; None where there is no feasibility."""
     resources: Resources
     latency_source: str
     is_lockstep: bool
