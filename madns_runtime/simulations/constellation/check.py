@@ -376,8 +376,9 @@ def _sgp4_fault(
         from madns_runtime.simulations.constellation.truth.propagators.sgp4_records import why_not
     except MissingExtraError:
         return None  # told by itself, with the command that installs it
-    fault = why_not(element_set, epoch_utc, 0.0)
+    fault = why_not(element_set, epoch_utc)
     if fault is None and parameters.propagator.PROPERTIES.needs_element_sets:
         # Who falls meanwhile is lost at that time, as on_agent_loss says.
-        fault = why_not(element_set, epoch_utc, duration_s, may_fall=True)
+        knot_s = parameters.segments.knot_s
+        fault = why_not(element_set, epoch_utc, duration_s, knot_s=knot_s)
     return fault
