@@ -1,7 +1,7 @@
 """
 Faults of a constellation scenario that bounds cannot tell, found before anything is launched.
 
-Element sets have faults that their syntax does not show: SGP4 itself is asked, at the scenario's start and end.
+Element sets have faults that their syntax does not show: SGP4 itself is asked, from the scenario's start to its end.
 Imports neither scipy nor numpy: `cosmos validate` answers at once.
 """
 
@@ -71,7 +71,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
         agents: Number of agents, each of which needs a satellite.
         base_directory: Folder of the scenario.
         names: The agents' names; globs are not judged without them.
-        duration_s: Of the run: SGP4 is asked for its end, too.
+        duration_s: Of the run: SGP4 is asked for all of it.
         is_lockstep: Whether simulated time waits for everybody.
         tick_hz: Of the ticks; rates are not judged without it.
     """
