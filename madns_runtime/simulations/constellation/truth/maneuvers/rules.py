@@ -330,8 +330,10 @@ class ManeuverDesk:
             start_s, status = snap(tick / rules.tick_hz, rules.knot_s), "postponed"
         end_s = snap(start_s + arc_s, rules.knot_s) if arc_s > 0.0 else start_s
         at_s = start_s + (end_s - start_s) / 2.0 if burn_s > 0.0 else start_s
-        if at_s > rules.duration_s:
-            over = f"{at_s:g} s is beyond the run's {rules.duration_s:g} s"
+        # Truth ends there: of what begins then it holds nothing, of a burn around the end half.
+        if start_s >= rules.duration_s or at_s > rules.duration_s:
+            where = "beyond" if at_s > rules.duration_s else "the end of"
+            over = f"{at_s:g} s is {where} the run's {rules.duration_s:g} s"
             return replace(refused, at_s=at_s, reason=over)
         effect = Effect(
             number=self._taken[refused.vehicle],
