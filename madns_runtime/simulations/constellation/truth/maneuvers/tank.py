@@ -1,5 +1,5 @@
 """
-What a vehicle weighs and what its tank holds: burns are booked as they are accepted. Pure.
+Mass of a vehicle and propellant in its tank: burns are booked as they are accepted. Pure.
 
 By the rocket equation each multiplies the mass by a factor of its own, so that what is left after all of them is right
 in whatever order they burn. Until a burn is over the tank holds what is booked for it, see `Tank.left_kg`: that depends
