@@ -363,6 +363,51 @@ def test_a_set_that_falls_is_followed_down_to_the_earth_and_stands_still_there()
         sgp4_states((high, falling), low.epoch_utc, knots_s)
 
 
+# 180 km up, with the drag of a balloon: down after three hours. After four SGP4 has no states of it, later some again.
+BALLOON = """FALL
+1 25544U 98067A   20045.18587073  .00000950  00000-0  10000-0 0  9995
+2 25544  51.6443 242.2052 0010000 264.6060 207.3845 16.10000000212795
+"""
+DOWN_S, WITHOUT_S = 10_640.0, 14_400.0
+
+
+@pytest.fixture
+def beside_a_balloon(tmp_path):
+    (tmp_path / "a.tle").write_text(BALLOON)
+    (balloon,) = read_element_sets(tmp_path / "a.tle")
+    high = replace(read_element_sets(DATA / "iridium10.csv")[0], epoch_utc=balloon.epoch_utc)
+    parameters = PropagationParameters(
+        settings=Sgp4Propagator(kind="sgp4"),
+        gravity=EGM_96,
+        epoch_utc=balloon.epoch_utc,
+        element_sets=(high, balloon),
+    )
+    return np.full((2, 6), 7e6), parameters
+
+
+@pytest.mark.parametrize("window_s", [300.0, 21_600.0])
+def test_a_set_that_sgp4_does_not_know_after_its_fall_ends_nobody_else(beside_a_balloon, window_s):
+    states, parameters = beside_a_balloon
+    alone = parameters.of([0])
+    for from_s in np.arange(0.0, 21_600.0, window_s):
+        knots_s = np.arange(from_s, from_s + window_s + 1.0, 10.0)
+
+        found = propagate(states, from_s, knots_s, parameters)
+
+        assert np.array_equal(found[:1], propagate(states[:1], from_s, knots_s, alone))
+        down_m = np.linalg.norm(found[1, knots_s > DOWN_S + 20.0, :3], axis=-1)
+        assert np.abs(down_m - EARTH_POLAR_RADIUS_M).max(initial=0.0) < 1e3
+        states = found[:, -1]
+    assert not states[1, 3:].any()
+
+
+def test_a_set_without_states_that_has_not_fallen_ends_the_run(beside_a_balloon):
+    _, parameters = beside_a_balloon
+
+    with pytest.raises(ConfigurationError, match="^FALL: SGP4: mean eccentricity .* at 14"):
+        propagate(np.full((2, 6), 7e6), WITHOUT_S, WITHOUT_S + np.arange(9.0), parameters)
+
+
 def test_julian_dates_are_those_of_the_almanac():
     assert julian_date(datetime(2000, 1, 1, 12, tzinfo=UTC)) == (2_451_545.0, 0.0)
     assert sum(julian_date(datetime(1957, 10, 4, 19, 26, 24, tzinfo=UTC))) == 2_436_116.31

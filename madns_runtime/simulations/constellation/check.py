@@ -1,7 +1,7 @@
 """
 Faults of a constellation scenario that bounds cannot tell, found before anything is launched.
 
-Element sets have faults that their syntax does not show: SGP4 itself is asked, at the scenario's start and end.
+Element sets have faults that their syntax does not show: SGP4 itself is asked, from the scenario's start to its end.
 Imports neither scipy nor numpy: `cosmos validate` answers at once.
 """
 
@@ -72,7 +72,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
         agents: Number of agents, each of which needs a satellite.
         base_directory: Folder of the scenario.
         names: The agents' names; globs are not judged without them.
-        duration_s: Of the run: SGP4 is asked for its end, too.
+        duration_s: Of the run: SGP4 is asked for all of it.
         is_lockstep: Whether simulated time waits for everybody.
         tick_hz: Of the ticks; rates are not judged without it.
     """
@@ -353,8 +353,9 @@ def _sgp4_fault(
         from madns_runtime.simulations.constellation.truth.propagators.sgp4_records import why_not
     except MissingExtraError:
         return None  # told by itself, with the command that installs it
-    fault = why_not(element_set, epoch_utc, 0.0)
+    fault = why_not(element_set, epoch_utc)
     if fault is None and parameters.propagator.PROPERTIES.needs_element_sets:
         # Who falls meanwhile is lost at that time, as on_agent_loss says.
-        fault = why_not(element_set, epoch_utc, duration_s, may_fall=True)
+        knot_s = parameters.segments.knot_s
+        fault = why_not(element_set, epoch_utc, duration_s, knot_s=knot_s)
     return fault

@@ -194,9 +194,10 @@ def propagate(
     shape = (len(states), len(knots_s), 6)
     if 0 in shape:
         return np.empty(shape)
-    is_down = is_inside_earth(states)
-    # Something flies in the place of a wreck, whose own way would lead to the Earth's centre.
-    flown = np.where(is_down[:, None], _ANY_ORBIT, states) if is_down.any() else states
+    is_down, flown = is_inside_earth(states), states
+    if is_down.any() and not parameters.settings.PROPERTIES.needs_element_sets:
+        # Something flies in the place of a wreck, whose own way would lead to the Earth's centre.
+        flown = np.where(is_down[:, None], _ANY_ORBIT, states)
     found = load_propagator(parameters.settings.kind).propagate(flown, t0_s, knots_s, parameters)
     _check_result(found, shape, knots_s, parameters)
     inside = is_inside_earth(found)
