@@ -192,7 +192,14 @@ def test_example_of_placement_does_what_it_says(tmp_path):
     assert sum(map(len, plan.agents_by_machine.values())) == 12
 
 
-@pytest.mark.parametrize("guide", [*GUIDES, ROOT / "CHANGELOG.md"], ids=lambda path: path.name)
+BESIDE = [path for folder in ("tests", "scenarios") for path in (ROOT / folder).rglob("*.md")]
+
+
+@pytest.mark.parametrize(
+    "guide",
+    [*GUIDES, ROOT / "CHANGELOG.md", *sorted(BESIDE)],
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
 def test_every_link_of_a_guide_leads_somewhere(guide):
     linked = re.findall(r"\]\(([^)\s]+)\)", guide.read_text("utf-8"))
 
