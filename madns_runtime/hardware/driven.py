@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -23,6 +22,7 @@ from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.status import StatusAccount, StatusLimits, limits_of, sample_period_s
 from madns_runtime.reactor.descriptors import allow_descriptors, ready
+from madns_runtime.signal_names import signal_name
 
 NOT_MADE_SAFE: Final = "could not be made safe: its driver failed, look at the device"
 DESCRIPTORS_BESIDE: Final = 256
@@ -221,4 +221,4 @@ def allow_descriptors_of(devices: Iterable[DeviceLaunch]) -> None:
 
 def exit_text(code: int) -> str:
     """Return how a process ended, in words."""
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+    return f"killed by {signal_name(-code)}" if code < 0 else f"exit code {code}"

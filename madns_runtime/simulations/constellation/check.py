@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -24,11 +25,11 @@ from madns_runtime.simulations.constellation.check_vehicles import (
 from madns_runtime.simulations.constellation.device_uses import uses_devices, uses_of
 from madns_runtime.simulations.constellation.parameters import (
     KNOTS_MAX,
+    PROPAGATORS,
     ConstellationParameters,
     CustomPropagator,
     ElementSetSatellites,
-    NumbaPropagator,
-    ScipyPropagator,
+    PropagatorProperties,
     Sgp4Propagator,
 )
 from madns_runtime.simulations.constellation.place_uses import place_uses_of, uses_places
@@ -189,8 +190,9 @@ def _idle_coefficients(parameters: ConstellationParameters) -> list[str]:
     if isinstance(propagator, CustomPropagator) or "drag" in propagator.forces:
         return []
     why = "drag is not among parameters.propagator.forces"
-    if not isinstance(propagator, ScipyPropagator | NumbaPropagator):
-        why = f"{propagator.kind} knows no drag by it; kind: scipy does, with drag among its forces"
+    if not propagator.PROPERTIES.knows_drag:
+        others = _kinds(lambda each: each.knows_drag)
+        why = f"{propagator.kind} knows no drag by it; take kind: {others}, with drag among its forces"
     remarks = []
     for number, vehicle in enumerate(parameters.vehicles):
         given = [
@@ -254,14 +256,15 @@ def _attitude_faults(parameters: ConstellationParameters) -> list[str]:
         if attitude is None:
             continue
         if by_engine and attitude.wheels is not None:
+            others = _kinds(lambda each: each.conserves_energy and not each.turns_bodies)
             faults.append(
                 f"{field}.wheels: {propagator.kind} does rigid bodies without wheels only; drop them, which "
-                "makes torques exact and without limit, or take kind: scipy or numba"
+                f"makes torques exact and without limit, or take kind: {others}"
             )
         if attitude.magnetorquers is not None and not propagator.PROPERTIES.follows_dipoles:
             faults.append(
                 f"{field}.magnetorquers: {propagator.kind} follows no magnetic dipole; drop them, or take "
-                "kind: scipy or numba"
+                f"kind: {_kinds(lambda each: each.follows_dipoles)}"
             )
         turn_deg = math.hypot(*attitude.rates_deg_s) * parameters.segments.knot_s
         if turn_deg >= 180.0:
@@ -270,6 +273,11 @@ def _attitude_faults(parameters: ConstellationParameters) -> list[str]:
                 f"{turn_deg:g} deg; a shorter segments.knot_s follows faster ones"
             )
     return faults
+
+
+def _kinds(are_meant: Callable[[PropagatorProperties], bool]) -> str:
+    """Return the kinds of propagators with some properties, as in: scipy or numba."""
+    return " or ".join(kind for kind, each in PROPAGATORS.items() if are_meant(each.PROPERTIES))
 
 
 def _missing_libraries(parameters: ConstellationParameters) -> list[str]:
