@@ -41,6 +41,10 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130
 
 
+FAILED_RUNS = (ExitCode.RUN_FAILED, ExitCode.MACHINES, ExitCode.INTERRUPTED)
+"""Exit codes of runs that went wrong, whatever their checks say."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
     """One thing wrong with what a person wrote, and where it stands."""
@@ -142,9 +146,27 @@ class CosmosError(Exception):
 
 
 class RunFailedError(CosmosError):
-    """The run did not come to its end; the message says who is to blame."""
+    """
+    The run did not come to its end; the message says who is to blame.
+
+    Args:
+        message: Of a run that was judged, its verdict.
+        exit_code: Its own, where it has one.
+        run: Its directory, where its evidence can be looked at.
+    """
 
     kind = "run_failed"
+
+    def __init__(
+        self, message: str, *, exit_code: ExitCode = ExitCode.RUN_FAILED, run: Path | None = None
+    ) -> None:
+        self.exit_code = exit_code
+        self.run = run
+        super().__init__(message)
+
+    def details(self) -> Mapping[str, Any]:
+        """Return the run's directory, if it is known."""
+        return {} if self.run is None else {"run": str(self.run)}
 
 
 class InputError(CosmosError):

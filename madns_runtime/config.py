@@ -216,7 +216,7 @@ class ScenarioDevice:
     hang_s: Annotated[float, Ge(0.1), Le(3600)] = 15.0
     """A device that says nothing for so long is given up: its process is killed and started anew."""
     frozen_s: Mapping[str, Annotated[float, Gt(0)]] = field(default_factory=dict)
-    """By input: values unchanged for so many seconds are frozen."""
+    """By input: one that has not changed, or not come, for so many seconds is frozen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -252,7 +252,7 @@ class HardwareSettings:
     lost: Annotated[int, Ge(0)] = 0
     """Times that devices may be lost."""
     frozen: Annotated[int, Ge(0)] = 0
-    """Times that inputs may be frozen (unchanged for their frozen_s)."""
+    """Times that inputs may be frozen (unchanged, or not come, for their frozen_s)."""
     lost_bytes: Annotated[int, Ge(0)] = 0
     """Bytes for which serial lines of emulated boards may have no room, such as of firmware that floods."""
     stimulus_late_ms: Annotated[float, Ge(0), Le(60_000)] = 10.0

@@ -47,7 +47,7 @@ def predict(
     if demand is None:
         return None
     latency_s, _ = latency_of(plan, given_ms=scenario.scenario.plan.latency_ms)
-    resources = resources_of(scenario, latency_s)
+    resources = resources_of(scenario, plan, latency_s)
     # The scenario has those of a first trial, of few agents, who fill no process.
     agents = replace(scenario.scenario.agents, per_process=per_process)
     filled = scenario.scenario.model_copy(update={"agents": agents})

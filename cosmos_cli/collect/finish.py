@@ -25,11 +25,11 @@ from cosmos_cli.collect.finished_run import refuse_living
 from cosmos_cli.collect.machine_sources import RecordingMachines
 from cosmos_cli.collect.previous_manifest import Earlier
 from cosmos_cli.collect.unread_files import find_unread, told_unread
-from cosmos_cli.errors import ExitCode, RunFailedError
+from cosmos_cli.errors import FAILED_RUNS, ExitCode, RunFailedError
 from cosmos_cli.evidence.completeness import ExpectedRecords, find_missing
 from cosmos_cli.evidence.devices import expected_devices, read_devices, recorded_files
 from cosmos_cli.evidence.expectations.of_run import judge_run, planned_expectations
-from cosmos_cli.evidence.manifest import build_manifest, pack_run
+from cosmos_cli.evidence.manifest import build_manifest, first_still_packed, pack_run
 from cosmos_cli.evidence.remarks import declared_streams, undeclared_remarks
 from cosmos_cli.evidence.run_directory import (
     RESERVE_BYTES,
@@ -79,6 +79,8 @@ class RunSummary:
     """run.json."""
     is_packed: bool = True
     """Whether the package holds all of this."""
+    kept_member: str = ""
+    """Name in an earlier package of a file that is no longer here as it was, for which that package was kept."""
 
     @property
     def exit_code(self) -> ExitCode:
@@ -94,6 +96,16 @@ class RunSummary:
     def last_line(self) -> str:
         """The verdict, and where the evidence lies."""
         return f"{self.verdict.text} | {self.run.path}"
+
+    def refuse_failed(self) -> None:
+        """
+        See that it can be worked with: it did not fail, lose a machine or end by an interruption.
+
+        Raises:
+            RunFailedError: It did; with its exit code.
+        """
+        if self.exit_code in FAILED_RUNS:
+            raise RunFailedError(self.last_line, exit_code=self.exit_code, run=self.run.path)
 
 
 def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five are optional and by name
@@ -148,10 +160,11 @@ def finish_run(  # noqa: PLR0913 - the launcher's whole account of a run; five a
         changed.setdefault(name, fault)
     if earlier.fault:
         changed[run.manifest_json.name] = earlier.fault
+    gone = {*changed, *(path.relative_to(run.path).as_posix() for path in gathered.unread)}
     gathered = dataclasses.replace(
         gathered,
         faults=(*gathered.faults, *(f"{name}: {what}" for name, what in changed.items())),
-        was={name: earlier.entries[name] for name in changed if name in earlier.entries},
+        was={name: entry for name, entry in earlier.entries.items() if name in gone},
     )
     return _conclude(
         run,
@@ -320,6 +333,8 @@ def _conclude(
     _keep_result(run, evidence.result)
     summary = _write_summary(run, gathered, evidence)
     progress("packing", 0.0)
+    if member := first_still_packed(run, gathered.was):
+        return dataclasses.replace(summary, is_packed=False, kept_member=member)
     pack = partial(pack_run, run, _start_s(document), without=gathered.unread)
     packed = _attempt(evidence, run.bundle, pack)
     if packed is not evidence:

@@ -1,4 +1,4 @@
-"""Machines that recorded a part of a run, by plan.json: where they are, and what is theirs. Pure."""
+"""Machines that recorded a part of a run, by plan.json: where they are, and what is theirs. Pure but for `RecordingMachines.read`."""
 
 from __future__ import annotations
 

@@ -23,6 +23,7 @@ from cosmos_cli.commands.fleet_command import (
 )
 from cosmos_cli.commands.run_arguments import RunArgument, RunsOption
 from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.evidence.manifest import told_as_kept
 from cosmos_cli.evidence.run_directory import RunDirectory, alone, runs_root
 from cosmos_cli.evidence.run_documents import Problem
 from cosmos_cli.evidence.run_search import find_run
@@ -117,6 +118,8 @@ def collect(
         (console.say if as_json else console.data)(summary.last_line)
         if summary.is_packed:
             console.say(f"packed: {found.bundle}")
+        elif summary.kept_member:
+            console.warn(told_as_kept(found, summary.kept_member))
     return int(ExitCode.DATA_INCOMPLETE if summary.missing else ExitCode.OK)
 
 

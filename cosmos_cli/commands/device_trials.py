@@ -109,11 +109,9 @@ def test_devices(trial: Trial) -> int:
         if outcome.failure is not None:
             console.say(f"{outcome.machine}: failed: {outcome.failure}")
     console.table(FIGURES, [row for name, each in told.items() for row in _rows(name, each)])
-    bad = [name for name, each in told.items() if _is_bad(each)]
+    bad = [name for name, each in told.items() if is_bad(each)]
     for name, each in told.items():
         console.data(f"{name}: {each['status']}, identity {each['identity'] or 'none'}")
-        if name in bad:
-            console.say(f"{name}: {each['error'] or each['why'] or 'no sample of any input'}")
         for text in shortcomings(each):
             console.say(f"{name}: {text}")
     failures = {each.machine: each.failure.to_mapping() for each in outcomes if each.failure}
@@ -143,7 +141,7 @@ def record_device(trial: Trial, directory: Path) -> int:
     for text in shortcomings(told):
         console.say(f"{trial.names[0]}: {text}")
     is_whole = not _dropped(told)
-    code = ExitCode.RUN_FAILED if _is_bad(told) or not is_whole else ExitCode.OK
+    code = ExitCode.RUN_FAILED if is_bad(told) or not is_whole else ExitCode.OK
     console.print_json({"directory": str(directory), "device": told, "exit_code": int(code)})
     return int(code)
 
@@ -178,28 +176,41 @@ def recorded(trial: Trial, directory: Path, *, seconds: float | None = None) -> 
 
 
 def shortcomings(told: Mapping[str, Any]) -> list[str]:
-    """Return what is missing in what a device gave, though it gave samples."""
-    found = []
+    """Return why a device failed, and what is missing in what it gave though it gave samples."""
+    found = [failure] if (failure := _failure(told)) else []
     if dropped := _dropped(told):
         found.append(f"not on record for want of room: {counted(dropped, 'record')}")
     if told.get("silent_inputs") and told.get("samples"):
         found.append(f"no value came of {', '.join(told['silent_inputs'])}")
-    for name, number in mapping_at(told, "report").items():
-        if name.endswith(NOT_FINITE) and number:
-            channel = name.removesuffix(NOT_FINITE)
-            found.append(f"{counted(number, 'sample')} of {channel} held what is no number")
+    for channel, number in _not_finite(told).items():
+        found.append(f"{counted(number, 'sample')} of {channel} held what is no number")
     return found
+
+
+def is_bad(told: Mapping[str, Any]) -> bool:
+    """Tell whether a device failed, or gave values that are no numbers."""
+    return bool(_failure(told) or _not_finite(told))
+
+
+def _failure(told: Mapping[str, Any]) -> str:
+    """Return why a device failed: errors, a loss, inputs that gave nothing at all, an end without its report; else empty."""
+    inputs = [each for each in told["channels"].values() if "samples" in each]
+    is_silent = bool(inputs) and not any(each["samples"] for each in inputs)
+    if mapping_at(told, "report").get("unreported"):
+        return str(told["why"] or told["error"] or "its process ended without its report")
+    if told["errors"] or told["lost"] or is_silent:
+        return str(told["error"] or told["why"] or "no sample of any input")
+    return ""
+
+
+def _not_finite(told: Mapping[str, Any]) -> dict[str, int]:
+    """Return how often each input was no number, by its name; those that were not at all are left out."""
+    counts = mapping_at(told, "report").items()
+    return {k.removesuffix(NOT_FINITE): n for k, n in counts if k.endswith(NOT_FINITE) and n}
 
 
 def _dropped(told: Mapping[str, Any]) -> int:
     return int(mapping_at(told, "report", "records").get("dropped", 0))
-
-
-def _is_bad(told: Mapping[str, Any]) -> bool:
-    """Tell whether a device gave errors, was lost, or has inputs and gave none of them."""
-    inputs = [each for each in told["channels"].values() if "samples" in each]
-    is_silent = bool(inputs) and not any(each["samples"] for each in inputs)
-    return bool(told["errors"] or told["lost"] or is_silent or told.get("report") is None)
 
 
 def _rows(full_name: str, told: Mapping[str, Any]) -> list[tuple[str, ...]]:

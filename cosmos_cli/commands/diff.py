@@ -23,7 +23,7 @@ from cosmos_cli.evidence.table_labels import run_labels
 from cosmos_cli.launch.execute import Detached, RunOptions, execute
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
 from cosmos_cli.models.overrides import told_as_options
-from cosmos_cli.system.named_file import check_writable, named_file
+from cosmos_cli.system.named_file import HTML, check_writable, named_file
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.plural import counted
 from cosmos_cli.ui.progress import told_progress
@@ -76,7 +76,7 @@ def diff(
     """
     Compare runs with the first: settings, timing, and record by record what their simulation recorded.
 
-    Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ.
+    Ends with 0 when they were compared, whatever was found; with --expect-same, 1 when their records differ; with --run, as a run that went wrong.
     """
     instead = "the exit code tells what was found" if expect_same or run_first else None
     console = Console(json=as_json, quiet=quiet, instead=instead)
@@ -84,7 +84,7 @@ def diff(
     names = [a, *others]
     chosen = Selection(agents=tuple(agents or ()), streams=tuple(streams or ()))
     if html is not None:
-        check_writable(html)
+        check_writable(html, HTML)
     if len(names) > RUNS_MAX:
         raise InputError(f"expected at most {RUNS_MAX} runs, got {len(names)}")
     if run_first:
@@ -164,25 +164,22 @@ def _load_all(
 def _run_all(
     scenarios: Sequence[ScenarioFile], console: Console, folder: Path | None
 ) -> tuple[list[RunDirectory], ExitCode]:
-    """Run scenarios one after the other; after one that failed, no further one."""
+    """
+    Run scenarios one after the other.
+
+    Raises:
+        RunFailedError: One but the last failed: no further one is run.
+    """
     root = runs_root(folder)
     runs, code = [], ExitCode.OK
     for number, scenario in enumerate(scenarios, start=1):
-        run, own = _run_one(scenario, console=console, root=root)
-        failed = own in (ExitCode.RUN_FAILED, ExitCode.MACHINES, ExitCode.INTERRUPTED)
-        if failed and number < len(scenarios):
-            raise typer.Exit(int(own))
-        runs.append(run)
-        code = own if code is ExitCode.OK else code
+        summary = execute(
+            scenario, RunOptions(runs=root), partial(make_view, quiet=console.quiet), console.say
+        )
+        assert not isinstance(summary, Detached)  # nobody asked for it
+        if number < len(scenarios):
+            summary.refuse_failed()
+        console.say(summary.last_line)
+        runs.append(summary.run)
+        code = summary.exit_code if code is ExitCode.OK else code
     return runs, code
-
-
-def _run_one(
-    scenario: ScenarioFile, *, console: Console, root: Path
-) -> tuple[RunDirectory, ExitCode]:
-    summary = execute(
-        scenario, RunOptions(runs=root), partial(make_view, quiet=console.quiet), console.say
-    )
-    assert not isinstance(summary, Detached)  # nobody asked for it
-    console.say(summary.last_line)
-    return summary.run, summary.exit_code

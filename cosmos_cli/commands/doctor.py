@@ -19,7 +19,7 @@ from cosmos_cli.commands.fleet_command import (
     LimitOption,
     SomeInventoryOption,
 )
-from cosmos_cli.doctor.case import Case, Wants
+from cosmos_cli.doctor.case import AgentBound, Case, Wants
 from cosmos_cli.doctor.finding import HERE, Finding, Severity, grouped
 from cosmos_cli.doctor.here import interface_of, look_here
 from cosmos_cli.doctor.judge import judge
@@ -33,17 +33,20 @@ from cosmos_cli.fleet.outcome import Outcome, failed, failure_teller
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
+from cosmos_cli.launch.capacity import ComputerFacts, processor_limits
 from cosmos_cli.launch.device_sampling import missing_for
-from cosmos_cli.launch.plan import make_plan
-from cosmos_cli.launch.plan_view import LATENCY_MS_UNKNOWN, feasibility_of, resources_of
+from cosmos_cli.launch.plan import LaunchPlan, make_plan
+from cosmos_cli.launch.plan_view import demand_of, feasibility_of, latency_of, resources_of
 from cosmos_cli.models.inventory import Machine
 from cosmos_cli.models.inventory.devices import driven_devices
 from cosmos_cli.models.inventory.machine import LOOPBACK
 from cosmos_cli.models.inventory_arguments import refuse_stray_limit
 from cosmos_cli.models.loading import ScenarioFile, load_scenario
+from cosmos_cli.models.planning import NOTHING
 from cosmos_cli.ui import invocation
 from cosmos_cli.ui.console import Column, Console, JsonOption, QuietOption, SetOption
 from cosmos_cli.ui.plural import counted
+from madns_runtime.plugin.api import Demand
 from madns_runtime.processes import state_directory
 
 FORKS_DEFAULT = 100
@@ -163,11 +166,13 @@ class _Examination:
             None if scenario is None else load_scenario(scenario, overrides, warn=console.warn)
         )
         self._needs = DoctorNeeds(machines, self._scenario_file)
+        self._plan = _plan_of(self._scenario_file, machines)
         count = len(self._fleet.targets) if self._fleet else 0
-        self.wants = _wants(self._scenario_file, machines, count)
+        self._demand: Demand | None = None
+        self.wants = _wants(self._scenario_file, self._plan, machines, count)
 
     def outcomes(self) -> list[Outcome[Told]]:
-        """Return what every machine told, this computer first."""
+        """Return what every machine told, this computer first, and learn what their processors bear."""
         outcomes: list[Outcome[Told]] = []
         own_addresses: set[str] = set()
         if self._fleet and self._fleet.targets:
@@ -189,7 +194,9 @@ class _Examination:
                     )
 
                 outcomes = self._fleet.each(task, failure_teller(self._console.say))
-        return [self._ask_here(own_addresses, outcomes), *outcomes]
+        outcomes = [self._ask_here(own_addresses, outcomes), *outcomes]
+        self.wants = dataclasses.replace(self.wants, bounds=self._bounds(outcomes))
+        return outcomes
 
     def _ask_here(
         self, own_addresses: set[str], outcomes: Sequence[Outcome[Told]]
@@ -216,8 +223,12 @@ class _Examination:
         return for_each([target], task)[0]
 
     def _feasibility(self, outcomes: Sequence[Outcome[Told]]) -> dict[str, Any] | None:
-        """Hold the four inequalities against the network as it was measured; None without a demand."""
-        if self._scenario_file is None:
+        """Hold the four inequalities against the network as it was measured; None in lockstep, and without a demand."""
+        if self._scenario_file is None or self._plan is None or self._plan.is_lockstep:
+            return None
+
+        self._demand = demand_of(self._scenario_file)
+        if self._demand is None:
             return None
 
         trips_ms = [
@@ -227,12 +238,35 @@ class _Examination:
             and (trip := outcome.value["round_trips"])
             and trip.get("p50_ms") is not None
         ]
-        given_ms = self._scenario_file.scenario.plan.latency_ms
-        unknown_s = (LATENCY_MS_UNKNOWN if given_ms is None else given_ms) / 1e3
-        latency_s = max(trips_ms) / 2e3 if trips_ms else unknown_s
-        resources = resources_of(self._scenario_file, latency_s)
-        found = feasibility_of(self._scenario_file, resources)
+        if trips_ms:
+            latency_s = max(trips_ms) / 2e3
+        else:
+            given_ms = self._scenario_file.scenario.plan.latency_ms
+            latency_s, _ = latency_of(self._plan, given_ms=given_ms)
+        resources = resources_of(self._scenario_file, self._plan, latency_s)
+        found = feasibility_of(self._scenario_file, resources, self._demand)
         return None if found is None else found.to_mapping()
+
+    def _bounds(self, outcomes: Sequence[Outcome[Told]]) -> dict[str, AgentBound]:
+        """Return how many agents each machine's processors are predicted to bear in real time; this computer is the host."""
+        if self._scenario_file is None or self._plan is None or self._plan.is_lockstep:
+            return {}
+
+        bounds: dict[str, AgentBound] = {}
+        for outcome in outcomes:
+            processors = outcome.value and outcome.value["limits"].get("usable_processors")
+            if not processors:
+                continue
+            name = outcome.machine
+            computer = ComputerFacts(name=name, processors=processors, is_host=name == HERE)
+            one_process, whole = processor_limits(
+                self._scenario_file.scenario, self._demand or NOTHING, computer
+            )
+            bounds[name] = AgentBound(
+                agents=min(one_process.agents, whole.agents),
+                is_of_process=one_process.agents < whole.agents,
+            )
+        return bounds
 
 
 def _devices(machines: Sequence[Machine]) -> list[dict[str, Any]]:
@@ -253,14 +287,22 @@ def _devices(machines: Sequence[Machine]) -> list[dict[str, Any]]:
     ]
 
 
-def _wants(file: ScenarioFile | None, machines: Sequence[Machine], count: int) -> Wants:
-    """Return what a scenario asks for of these machines, *count* of which are others than this computer."""
-    affinity = _affinity(machines, file)
+def _plan_of(file: ScenarioFile | None, machines: Sequence[Machine]) -> LaunchPlan | None:
+    """Return who would run where; None without a scenario."""
     if file is None:
-        return Wants(machines=count, affinity=affinity)
-    plan = make_plan(
+        return None
+    return make_plan(
         file.scenario, machines or (LOOPBACK,), fault_at=file.fault, labels=file.labels
     )
+
+
+def _wants(
+    file: ScenarioFile | None, plan: LaunchPlan | None, machines: Sequence[Machine], count: int
+) -> Wants:
+    """Return what a scenario asks for of these machines, *count* of which are others than this computer."""
+    affinity = _affinity(machines, file)
+    if file is None or plan is None:
+        return Wants(machines=count, affinity=affinity)
     agents: Counter[str] = Counter()
     for planned in plan.machines:
         name = HERE if planned.machine.connection == "local" else planned.name

@@ -62,7 +62,8 @@ def judge(
     Judge a finished run again by the expectations of its scenario, or of another.
 
     Nothing of the run is changed. Ends with 0 if all hold, 4 if one is broken, and 5 if data of the run are missing
-    or none of the expectations could be judged.
+    or none of the expectations could be judged; of a run that failed (1), whose machines did (3) or that was
+    interrupted (130) with that code, whatever holds.
     """
     console = Console(json=as_json, quiet=quiet, instead="the exit code is the verdict's")
     found = find_run(runs_root(folder), run)
@@ -80,7 +81,7 @@ def judge(
         expectations = expectations_for(found, file, tables)
     judged = judge_run(found, tables, expectations, document)
     missing = (*_missing(document), *judged.gaps())
-    code, text = conclusion_of_expectations(judged.results, missing)
+    code, text = conclusion_of_expectations(judged.results, missing, document)
     nulls = _not_finite(document)
     console.print_json(_told(found, judged, code, text, missing) | {"records_not_finite": nulls})
     if not as_json:

@@ -26,6 +26,7 @@ from cosmos_cli.launch.place_plan import check_places
 from cosmos_cli.launch.plan import LaunchPlan, make_plan
 from cosmos_cli.launch.plan_view import (
     LOCKSTEP_WORDS,
+    buffer_words,
     demand_mapping,
     demand_of,
     feasibility_of,
@@ -99,7 +100,7 @@ def plan(
     latency_s, latency_source = latency_of(
         launch_plan, given_ms=given.latency_ms if latency_ms is None else latency_ms
     )
-    offered = resources_of(scenario_file, latency_s)
+    offered = resources_of(scenario_file, launch_plan, latency_s)
     resources = dataclasses.replace(
         offered,
         workers=workers or offered.workers,
@@ -109,6 +110,8 @@ def plan(
         else bandwidth_mbit * 1e6 / BITS_PER_BYTE,
     )
     outlook = _Outlook.of(scenario_file, launch_plan, resources, latency_source)
+    if outlook.demand is not None and (words := buffer_words(given, outlook.demand)):
+        console.warn(words)
     devices = list(itertools.chain(*plan_devices(scenario_file, launch_plan).values()))
     _show(console, launch_plan, devices, outlook, missing=given.missing)
     if outlook.feasibility and not outlook.feasibility.holds:

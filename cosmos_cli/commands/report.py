@@ -20,7 +20,7 @@ from cosmos_cli.evidence.run_search import find_run
 from cosmos_cli.report.build import build_sections, with_simulation
 from cosmos_cli.report.html import write_report
 from cosmos_cli.report.terminal import print_report
-from cosmos_cli.system.named_file import check_writable, named_file
+from cosmos_cli.system.named_file import HTML, check_writable, named_file
 from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 
 
@@ -37,7 +37,7 @@ def report(
     """Show what a run recorded: verdict, checks, tables; figures are in report.html of the run."""
     console = Console(json=as_json, quiet=quiet)
     if html is not None:
-        check_writable(html)
+        check_writable(html, HTML)
     found = find_run(runs_root(folder), run)
     document = collected_document(found, run)
     refuse_foreign_tables(found)

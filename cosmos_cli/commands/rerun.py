@@ -43,8 +43,6 @@ from cosmos_cli.ui.console import Console, JsonOption, QuietOption
 from cosmos_cli.ui.progress import told_progress
 from cosmos_cli.view.factory import make_view
 
-FAILED = (ExitCode.RUN_FAILED, ExitCode.MACHINES, ExitCode.INTERRUPTED)
-
 
 def rerun(
     run: RunArgument,
@@ -70,7 +68,7 @@ def rerun(
     Fly a recorded run again without its hardware: in lockstep, each device played back from its records.
 
     Its checks are judged on the rerun too, and its timeline takes place again. Today's software flies where it can be stepped, and what of it differs from what was flown is named. Ends with 0 when all that is compared is the same, with 1 when
-    something differs, with 2 when the run cannot be flown again.
+    something differs, with 2 when the run cannot be flown again; with 1, 3 (a machine) or 130 (interrupted) and an error when the rerun itself fails.
     """
     if as_recorded and as_recorded_from is not None:
         raise InputError("--as-recorded and --as-recorded-from DIR: give one of them")
@@ -114,9 +112,8 @@ def _fly(
         console.say,
     )
     assert not isinstance(summary, Detached)  # nobody asked for it
+    summary.refuse_failed()
     console.say(summary.last_line)
-    if summary.exit_code in FAILED:
-        raise typer.Exit(int(summary.exit_code))
     with told_progress(console, "rerun") as progress:
         after = open_side(summary.run, summary.run.name)
         streams = compare(before, after, Selection(), progress)

@@ -84,6 +84,9 @@ def run(
     with 0, 2 or 3.
     """
     console = Console(json=json, quiet=quiet)
+    if junit is not None and (check or detach):
+        raise InputError("--junit writes the verdict: leave out --check and --detach")
+    prepare_junit(junit)
     duration = [] if duration_s is None else [f"time.duration_s={duration_s!r}"]
     options = RunOptions(
         runs=runs_root(runs),
@@ -95,9 +98,6 @@ def run(
         forks=forks,
         connecting=ConnectOptions(accept_new_host_keys=accept_new_host_keys),
     )
-    if junit is not None and (check or detach):
-        raise InputError("--junit writes the verdict: leave out --check and --detach")
-    prepare_junit(junit)
     with told_as_options({"time.duration_s": "--duration"}, set_ or ()):
         checked = load_scenario(scenario, [*(set_ or ()), *duration], warn=console.warn)
     if check:

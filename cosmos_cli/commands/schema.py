@@ -18,6 +18,7 @@ from cosmos_cli.models.separate_process import (
     Work,
     work_separately,
 )
+from cosmos_cli.system.named_file import JSON_SCHEMA, check_no_other
 from cosmos_cli.ui.console import Console, JsonOption
 from madns_runtime.bounded_files import read_regular_file
 from madns_runtime.config import Timeouts
@@ -58,6 +59,7 @@ def schema(
         if check:
             _check(output, text)
         else:
+            check_no_other(output, JSON_SCHEMA)
             output.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{output}: {error.strerror}") from error

@@ -15,6 +15,16 @@ _AGENTS, _DEADLINE, _NETWORK, _SCHEDULING = Agents(count=1), Deadline(), Network
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AgentBound:
+    """The most agents that a machine's processors are predicted to bear."""
+
+    agents: float
+    """Infinity for any number."""
+    is_of_process: bool = False
+    """Whether it is the one thread of a process that bears no more, rather than all processors."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Wants:
     """Wishes of a run: the scenario's settings, or the defaults without one."""
 
@@ -31,6 +41,8 @@ class Wants:
     agents: Mapping[str, int] = field(default_factory=dict)
     """Agents by machine, as the scenario would place them."""
     agents_per_process: int = 1
+    bounds: Mapping[str, AgentBound] = field(default_factory=dict)
+    """By machine that told its processors; empty in lockstep, where agents have the time that they need."""
     affinity: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     """By machine, the processors that agents are to use there, where the inventory or the scenario says it."""
     machines: int = 0

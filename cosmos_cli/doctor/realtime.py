@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from cosmos_cli.doctor.case import Case
 from cosmos_cli.doctor.finding import CheckRemark, Severity
 from cosmos_cli.ui.plural import counted
+from madns_runtime.timing.pack_split import PACK_AGENTS_MAX
 
 CAP_IPC_LOCK = 14
 REALTIME_SHARE_WARNING = 0.9
@@ -15,8 +16,6 @@ SLOW_CLOCK_SOURCES = frozenset(("hpet", "acpi_pm", "jiffies", "pit"))
 BUSY_PROCESSORS_WARNING = 0.5
 BUSY_PROCESSORS_NOTE = 0.1
 STEAL_SHARE_WARNING = 0.01
-TICKS_A_PROCESSOR_HZ_MAX = 4500.0
-"""Empty steps, one process per agent, on a processor of a server (measured: 93 agents at 100 Hz on two)."""
 LIMITS = "/etc/security/limits.d/90-cosmos.conf"
 
 
@@ -229,24 +228,29 @@ def cpu_quota(case: Case) -> Iterator[CheckRemark]:
 
 
 def processors(case: Case) -> Iterator[CheckRemark]:
-    """Agents that the scenario places there, against its processors."""
+    """Agents that the scenario places there, against those that its processors are predicted to bear."""
     agents, usable = case.agents, case.part("limits").get("usable_processors")
-    if not agents or not usable:
+    bound = case.wants.bounds.get(case.machine)
+    if not agents or not usable or bound is None:
         return
-    load_hz = agents * case.wants.tick_hz / usable
-    is_much = load_hz > TICKS_A_PROCESSOR_HZ_MAX
+    per_process = case.wants.agents_per_process
+    found = (
+        f"{counted(agents, 'agent')} at {case.wants.tick_hz:g} Hz on {counted(usable, 'processor')}"
+    )
+    if agents <= bound.agents:
+        yield CheckRemark(found=found)
+        return
+    cures = ["a lower tick_hz"]
+    if bound.is_of_process:
+        cures.append("fewer agents in a process (agents.per_process)")
+    else:
+        cures.insert(0, "fewer agents there (cosmos_agents, placement)")
+        if per_process < PACK_AGENTS_MAX:
+            cures.append("more agents in a process (agents.per_process)")
     yield CheckRemark(
-        level=Severity.WARNING if is_much else Severity.OK,
-        found=f"{counted(agents, 'agent')} at {case.wants.tick_hz:g} Hz on {counted(usable, 'processor')}"
-        + (
-            f": a fast one does {TICKS_A_PROCESSOR_HZ_MAX:g} empty steps a second"
-            if is_much
-            else ""
-        ),
-        cure="fewer agents there (cosmos_agents, placement), a lower tick_hz, or several agents in a"
-        " process (agents.per_process)"
-        if is_much
-        else "",
+        level=Severity.WARNING,
+        found=f"{found}: up to {bound.agents:.0f} are predicted with agents.per_process {per_process}",
+        cure=" or ".join([", ".join(cures[:-1]), cures[-1]]),
     )
 
 

@@ -1,4 +1,4 @@
-"""Records that a run must have, and those of them that are missing, cut or dropped. Pure."""
+"""Records that a run must have, and those of them that are missing, cut or dropped. Pure but for `ExpectedRecords.read`."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ from cosmos_cli.evidence.verdict import CheckResult, at_most, is_number
 from cosmos_cli.ui.foreign_text import clean_line
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import HardwareSettings
+from madns_runtime.hardware.count_table import BEYOND_LIMITS
 from madns_runtime.hardware.profiles import POINT_COUNTS
 from madns_runtime.plain_values import mapping_at
 from madns_runtime.recording.records import DEVICE_LOSSES, WHOLE_MAX
@@ -25,8 +26,19 @@ NO_REPORT = "unknown"
 WHY_MISSING = "no account of it: its supervisor did not come to its end"
 LOST_BYTES = "lost_bytes"
 """Count of bytes for which a line had no room: firmware that floods."""
+SPOILED = (
+    "bad_checksums",
+    "damaged_lines",
+    "edges_lost",
+    "epochs_given_up",
+    "frames_lost",
+    "joystick_lost",
+)
+"""Counts of what came and was not whole, or did not come to the driver."""
+GARBAGE_SHARE_MAX = 0.05
+"""Of a line's bytes: one that is opened in mid-frame has some that belong to none, and that is no fault."""
 LOSSES_TOLD_MAX = 20
-"""Remarks on losses between devices and agents."""
+"""Remarks of one kind on devices."""
 NEVER_PLAYED = ("skipped", "lost", "refused")
 """Counts of a profile's points that were due and never put out."""
 _TOLD_APART = frozenset(
@@ -128,6 +140,7 @@ def device_remarks(
         *silent_input_remarks(devices),
         *stale_sample_remarks(devices),
         *refusal_remarks(devices),
+        *spoiled_data_remarks(devices),
     )
 
 
@@ -154,9 +167,7 @@ def device_loss_remarks(
             found.append(
                 f"device {device}: agents did not take all in time: frames_missed {missed:g}"
             )
-    rest = len(found) - LOSSES_TOLD_MAX
-    more = [f"{counted(rest, 'more loss')} between devices and agents"] if rest > 0 else []
-    return tuple(clean_line(text) for text in (*found[:LOSSES_TOLD_MAX], *more))
+    return _bounded(found, "more loss", " between devices and agents")
 
 
 def silent_input_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
@@ -166,9 +177,7 @@ def silent_input_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str,
         for device, account in devices.items()
         if (silent := account.get("silent_inputs"))
     ]
-    rest = len(found) - LOSSES_TOLD_MAX
-    more = [f"{counted(rest, 'more device')} with an input of which no value ever came"]
-    return (*found[:LOSSES_TOLD_MAX], *(more if rest > 0 else ()))
+    return _bounded(found, "more device", " with an input of which no value ever came")
 
 
 def stale_sample_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
@@ -179,9 +188,7 @@ def stale_sample_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str,
         for device, account in devices.items()
         if account.get("samples") and (age_s := account.get("least_stale_age_s"))
     ]
-    rest = len(found) - LOSSES_TOLD_MAX
-    more = [f"{counted(rest, 'more device')} of which each sample was stale when it came"]
-    return (*found[:LOSSES_TOLD_MAX], *(more if rest > 0 else ()))
+    return _bounded(found, "more device", " of which each sample was stale when it came")
 
 
 def refusal_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
@@ -191,9 +198,31 @@ def refusal_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]
         for device, account in devices.items()
         if (refused := int(mapping_at(account, "counts").get("refused", 0)))
     ]
-    rest = len(found) - LOSSES_TOLD_MAX
-    more = [f"{counted(rest, 'more device')} that refused something"]
-    return (*found[:LOSSES_TOLD_MAX], *(more if rest > 0 else ()))
+    return _bounded(found, "more device", " that refused something")
+
+
+def spoiled_data_remarks(devices: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return a remark per device of which something was lost, not whole or beyond its limits; at most LOSSES_TOLD_MAX, then how many more."""
+    found: list[str] = []
+    for device, account in devices.items():
+        counts = mapping_at(account, "counts")
+        told = [
+            f"{name} {number:g}"
+            for name, number in counts.items()
+            if number and (name in SPOILED or name.endswith(BEYOND_LIMITS))
+        ]
+        garbage, received = counts.get("garbage_bytes", 0), counts.get("received_bytes", 0)
+        if garbage > GARBAGE_SHARE_MAX * received:
+            told.append(f"garbage_bytes {garbage:g} of {received:g}")
+        if told:
+            found.append(f"device {device}: lost, spoiled or beyond limits: {', '.join(told)}")
+    return _bounded(found, "more device", " with something lost, spoiled or beyond limits")
+
+
+def _bounded(found: Sequence[str], noun: str, rest_of: str) -> tuple[str, ...]:
+    """Return remarks, at most LOSSES_TOLD_MAX, and then how many more there are."""
+    told, rest = map(clean_line, found[:LOSSES_TOLD_MAX]), len(found) - LOSSES_TOLD_MAX
+    return (*told, *([f"{counted(rest, noun)}{rest_of}"] if rest > 0 else ()))
 
 
 def _lost_bytes_checks(

@@ -6,9 +6,12 @@ The package is one .tar.zst beside the run's directory, the same bytes for the s
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
+import io
 import os
+import shlex
 import tarfile
 from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
@@ -137,3 +140,40 @@ def pack_run(run: RunDirectory, mtime_s: int, *, without: Container[Path] = ()) 
                 member.size = os.fstat(stream.fileno()).st_size
                 archive.addfile(member, stream)
     return run.bundle
+
+
+def first_still_packed(run: RunDirectory, entries: Mapping[str, Mapping[str, Any]]) -> str:
+    """
+    Return the name within the package of the first file that is there as its entry says; empty if none is.
+
+    Args:
+        run: The run; it may have no package.
+        entries: Of the manifest, by the names of files below the run's directory.
+    """
+    if not entries:
+        return ""
+    # A package that is cut or damaged holds what comes before.
+    with (
+        contextlib.suppress(OSError, EOFError, tarfile.TarError, zstandard.ZstdError),
+        run.bundle.open("rb") as raw,
+        zstandard.ZstdDecompressor().stream_reader(raw) as packed,
+        tarfile.open(fileobj=packed, mode="r|") as archive,
+    ):
+        for member in archive:
+            entry = entries.get(member.name.partition("/")[2], {})
+            content = archive.extractfile(member) if entry else None
+            if isinstance(content, io.BufferedReader):
+                digest = hashlib.file_digest(content, "sha256").hexdigest()
+                if digest == entry.get("sha256"):
+                    return member.name
+    return ""
+
+
+def told_as_kept(run: RunDirectory, member: str) -> str:
+    """Return why the package of a run was not written anew, and how a member that it alone holds is brought back."""
+    bundle = shlex.quote(str(run.bundle))
+    return (
+        f"{run.bundle}: left as it was, for it holds what is no longer here as it was collected; bring that back, then"
+        f" repeat: tar -xf {bundle} -C {run.shell_path} --strip-components=1 {shlex.quote(member)}; to give it up,"
+        " remove the package first"
+    )

@@ -1,4 +1,4 @@
-"""Remarks on what a scenario's timeline asked for and the run did not do: refused, or never come to. Pure."""
+"""Remarks on what a scenario's timeline asked for and the run did not do: refused, or never come to. Pure but for `told_events`."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeGuard
 
-from cosmos_cli.errors import ExitCode
+from cosmos_cli.errors import FAILED_RUNS, ExitCode
 from cosmos_cli.ui.plural import counted
 from madns_runtime.conditions.reports import BROKEN
 from madns_runtime.plain_values import first_few, mapping_at
@@ -339,7 +339,7 @@ def _conclude(
         return ExitCode.BUDGET_BROKEN, text + hint
     if facts.problems:
         return ExitCode.MACHINES, f"NOT CLEAN: {_listed(facts.problems)}"
-    return ExitCode.OK, _all_hold(len(checks))
+    return ExitCode.OK, f"PASSED: {_all_hold(len(checks))}"
 
 
 def _lost(facts: RunFacts, agent: str) -> str:
@@ -347,25 +347,31 @@ def _lost(facts: RunFacts, agent: str) -> str:
 
 
 def _all_hold(count: int) -> str:
-    return f"PASSED: {counted(count, 'check')} hold{'s' if count == 1 else ''}"
+    return f"{counted(count, 'check')} hold{'s' if count == 1 else ''}"
 
 
 def conclusion_of_expectations(
-    results: Sequence[CheckResult], missing: Sequence[str]
+    results: Sequence[CheckResult], missing: Sequence[str], document: Mapping[str, Any]
 ) -> tuple[ExitCode, str]:
     """
-    Return exit code and verdict of a finished run that is judged by expectations alone.
+    Return exit code and verdict of a finished run that is judged by expectations: no run that failed passes by them.
 
     Args:
         results: Of those that were judged.
         missing: Data that are missing, one line each.
+        document: run.json, whose `exit_code` and `verdict` tell how the run itself ended.
     """
-    if missing:
-        return ExitCode.DATA_INCOMPLETE, f"DATA INCOMPLETE: {_listed(missing)}"
+    code, text = ExitCode.OK, _all_hold(len(results))
     broken = [result for result in results if not result.passed]
-    if broken:
-        return ExitCode.BUDGET_BROKEN, f"CHECK BROKEN: {_listed([_told(each) for each in broken])}"
-    return ExitCode.OK, _all_hold(len(results))
+    if missing:
+        code, text = ExitCode.DATA_INCOMPLETE, f"DATA INCOMPLETE: {_listed(missing)}"
+    elif broken:
+        told = _listed([_told(each) for each in broken])
+        code, text = ExitCode.BUDGET_BROKEN, f"CHECK BROKEN: {told}"
+    if document.get("exit_code") in FAILED_RUNS:
+        how = first_line(str(document.get("verdict") or "the run failed"))
+        return ExitCode(document["exit_code"]), f"{how}; judged by what it recorded: {text}"
+    return code, text if code else f"PASSED: {text}"
 
 
 def _told(check: CheckResult) -> str:

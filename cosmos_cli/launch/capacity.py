@@ -4,7 +4,7 @@ How many agents fit: the largest number that each limit allows, predicted. Pure.
     capacity = predict_capacity(scenario, demand, computers, resources)
     capacity.agents, capacity.binding.name
 
-Limits are of processors (the host's loop, what one process of agents can do, each machine as a whole), of the network
+Limits are of processors (the host's loop and workers, what one process of agents can do, each machine), of the network
 and the buffers (inequalities 2.7, 2.8, 2.10), and of the socket that takes the burst of all agents. Agents are thought
 to be spread evenly over the machines, in processes of `agents.per_process`. What a tick costs was measured on a 2-core
 x86-64 virtual machine (`TickCosts`); another machine's speed is a factor, 1 if nobody has measured it.
@@ -17,7 +17,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cosmos_cli.launch.feasibility import COUNT_MAX, IP_UDP_BYTES, Resources, finite, judge
+from cosmos_cli.launch.feasibility import (
+    COUNT_MAX,
+    IP_UDP_BYTES,
+    Resources,
+    finite,
+    is_within,
+    judge,
+)
 from cosmos_cli.models.scenario import Scenario
 from madns_runtime.plugin.api import Demand
 from madns_runtime.timing.pack_split import PACK_AGENTS_MAX
@@ -123,13 +130,29 @@ def predict_capacity(  # noqa: PLR0913 - all but four by name
         raise ValueError("expected computers with agents, and one of them or another as the host")
     costs, tick_hz = costs or TickCosts(), scenario.agents.tick_hz
     load = _ProcessorLoad(
-        costs, demand, tick_hz, scenario.agents.per_process, list(computers), resources.workers
+        costs,
+        demand,
+        tick_hz,
+        scenario.agents.per_process,
+        list(computers),
+        resources.workers_for(demand),
     )
     granted = receive_buffer_bytes or 2 * scenario.network.receive_buffer_bytes
-    limits = [load.host_loop(), load.one_process(), *map(load.whole, computers)]
+    limits = [load.host_loop(), load.all_workers(), load.one_process()]
+    limits += map(load.whole, computers)
     limits += _inequalities(demand, resources, tick_hz)
     limits.append(_burst(demand, granted))
     return Capacity(tick_hz=tick_hz, limits=tuple(limits))
+
+
+def processor_limits(
+    scenario: Scenario, demand: Demand, computer: ComputerFacts
+) -> tuple[Limit, Limit]:
+    """Return what the agents of one computer are limited to: by the thread of one process, and by all its processors."""
+    agents = scenario.agents
+    costs, workers = TickCosts(), scenario.executor.workers
+    load = _ProcessorLoad(costs, demand, agents.tick_hz, agents.per_process, [computer], workers)
+    return load.one_process(), load.whole(computer)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,11 +182,10 @@ class _ProcessorLoad:
         return (packs * self.costs.wake_up_s + ticks_s) * self.tick_hz
 
     def truth_s(self, agents: int) -> float:
-        """Return what the host's workers compute for so many agents, s per second, at speed 1."""
-        buffer_s = self.demand.buffer_s
-        if buffer_s <= 0.0 or math.isinf(buffer_s):
-            return 0.0
-        return agents * self.demand.batch_compute_s / buffer_s
+        """Return what the host's workers compute for so many agents, batches and maneuvers, s per second, at speed 1."""
+        demand = self.demand
+        batches = demand.batch_compute_s / demand.buffer_s if demand.buffer_s > 0.0 else 0.0
+        return agents * (batches + demand.sync_rate_hz * demand.sync_compute_s)
 
     def host_loop(self) -> Limit:
         each_s = self.costs.exchange_s * self.tick_hz / self.host.speed
@@ -171,6 +193,17 @@ class _ProcessorLoad:
             name="host's loop",
             agents=math.floor(SHARE_USABLE / each_s),
             why=f"{self.costs.exchange_s * 1e6 / self.host.speed:.0f} us per agent and tick, in one thread",
+        )
+
+    def all_workers(self) -> Limit:
+        """Return the limit of the host's workers: all batches, and maneuvers at their rate over a long time."""
+        each = self.truth_s(1) / self.host.speed
+        maneuvers_hz = self.demand.sync_rate_hz
+        what = f"batches and {maneuvers_hz:.3g} maneuvers a second" if maneuvers_hz else "batches"
+        return Limit(
+            name="host's workers",
+            agents=_largest(lambda agents: is_within(agents * each, self.workers)),
+            why=f"{each:.2g} of a worker per agent for {what}, N_p = {self.workers}",
         )
 
     def one_process(self) -> Limit:

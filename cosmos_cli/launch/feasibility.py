@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from cosmos_cli.launch.busiest_interval import ROUNDING, Sending, busiest_interval
@@ -32,7 +32,7 @@ class Resources:
     """Resources of host and network."""
 
     workers: int
-    """N_p: processes that propagate."""
+    """N_p: processes that propagate, as many as are asked for."""
     bandwidth_bytes_s: float
     """B_n: of the host's own link, one direction taken for both."""
     latency_s: float
@@ -41,6 +41,14 @@ class Resources:
     """Maneuvers that reach the host at one instant at worst; None for one of every agent."""
     has_headers: bool = True
     """Whether sizes are of messages, to which headers come; else all is counted in them already."""
+    processors: int | None = None
+    """Processors that those workers share; None where nobody knows, or a cluster's workers have their own."""
+
+    def workers_for(self, demand: Demand) -> int:
+        """Return N_p as it counts: where a worker's time was measured, no more work at once than there are processors."""
+        if not demand.measured or self.processors is None:
+            return self.workers
+        return min(self.workers, self.processors)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,6 +118,8 @@ class Feasibility:
     inequalities: tuple[Inequality, ...]
     measured: bool
     """Whether compute times were measured on this machine; else they are declared."""
+    workers: int
+    """N_p as it was counted: those asked for, or the processors where they are fewer and times were measured."""
 
     @property
     def holds(self) -> bool:
@@ -129,6 +139,7 @@ class Feasibility:
             "holds": self.holds,
             "binding": self.binding.number,
             "compute_times": "measured" if self.measured else "declared",
+            "workers": self.workers,
             "inequalities": [item.to_mapping() for item in self.inequalities],
         }
 
@@ -143,6 +154,8 @@ def judge(demand: Demand, resources: Resources, *, agents: int, tick_hz: float) 
         agents: N_a.
         tick_hz: R_a.
     """
+    workers = resources.workers_for(demand)
+    resources = replace(resources, workers=workers)
     return Feasibility(
         agents=agents,
         inequalities=(
@@ -152,6 +165,7 @@ def judge(demand: Demand, resources: Resources, *, agents: int, tick_hz: float) 
             _bandwidth(demand, resources, agents),
         ),
         measured=demand.measured,
+        workers=workers,
     )
 
 
@@ -290,9 +304,7 @@ def _first_too_busy(sendings: Sequence[Sending], bandwidth_bytes_s: float) -> fl
 
 def wire_bytes(message_bytes: int) -> int:
     """Return the bytes that a message of so many encoded bytes costs on the wire, all headers included."""
-    if message_bytes <= 0:
-        return 0
-    datagrams = math.ceil(message_bytes / FRAGMENT_BYTES_MAX)
+    datagrams = max(1, math.ceil(message_bytes / FRAGMENT_BYTES_MAX))
     return message_bytes + datagrams * (DATAGRAM_OVERHEAD_BYTES + IP_UDP_BYTES)
 
 

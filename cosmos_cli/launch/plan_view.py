@@ -26,6 +26,7 @@ from cosmos_cli.models.planning import Planning
 from cosmos_cli.ui.console import Column, Console
 from cosmos_cli.ui.plural import counted
 from madns_runtime.config import DeviceLaunch
+from madns_runtime.lockstep.partition import processors_here
 from madns_runtime.plugin.api import Demand, Flow
 
 LATENCY_MS_UNKNOWN = 0.5
@@ -86,15 +87,20 @@ def demand_of(scenario_file: ScenarioFile) -> Demand | None:
     return given.applied_to(demand)
 
 
-def resources_of(scenario_file: ScenarioFile, latency_s: float) -> Resources:
+def resources_of(
+    scenario_file: ScenarioFile, launch_plan: LaunchPlan, latency_s: float
+) -> Resources:
     """Return what host and network offer by the scenario, over a link of BANDWIDTH_MBIT_DEFAULT if it names none."""
     scenario, given = scenario_file.scenario, scenario_file.scenario.plan
+    host = launch_plan.host
+    is_here = (host is None or host.connection == "local") and not scenario.executor.address
     return Resources(
         workers=given.workers or scenario.executor.workers,
         bandwidth_bytes_s=(given.bandwidth_mbit or BANDWIDTH_MBIT_DEFAULT) * 1e6 / BITS_PER_BYTE,
         latency_s=latency_s,
         maneuvers_at_once=given.maneuvers_at_once,
         has_headers=given.has_headers,
+        processors=processors_here() if is_here else None,
     )
 
 
@@ -183,6 +189,16 @@ def show_flows(console: Console, demand: Demand, resources: Resources) -> None:
         console.data("; ".join(text for text in (told, told_s) if text))
 
 
+def buffer_words(given: Planning, demand: Demand) -> str | None:
+    """Say that a given S_a holds no batch; None if it does, or none is given: a simulation's own fits its batches."""
+    if not given.buffer_bytes or demand.batch_bytes <= given.buffer_bytes:
+        return None
+    return (
+        f"plan.buffer_bytes: a buffer of {given.buffer_bytes:,} B (S_a) does not hold a batch of {demand.batch_bytes:,} B (S_b),"
+        f" so that no agent can go on for T_bi = {demand.buffer_s:g} s; correct buffer_bytes, or batch_bytes and buffer_s"
+    )
+
+
 def demand_mapping(demand: Demand, resources: Resources) -> dict[str, Any]:
     """Return a demand as plain values, its flows as they travel and maneuvers among them; null stands for infinity."""
     figures = {
@@ -195,7 +211,7 @@ def demand_mapping(demand: Demand, resources: Resources) -> dict[str, Any]:
             "name": each.name,
             "wire_bytes": each.wire_bytes,
             "rate_hz": each.rate_hz,
-            "within_s": each.within_s,
+            "within_s": finite(each.within_s),
             "senders_max": finite(each.senders_max),
         }
         for each in sendings_of(demand, resources)
@@ -225,16 +241,30 @@ def show_feasibility(  # noqa: PLR0913 - what is printed, and two more by name
         return
     console.data("")
     console.table(INEQUALITIES, [_row(item) for item in feasibility.inequalities])
-    compute = "measured here" if feasibility.measured else "declared"
+    compute = _compute_words(feasibility)
+    fewer = (
+        f" (of {resources.workers} workers: no more run at once on {counted(feasibility.workers, 'processor')})"
+        if feasibility.workers < resources.workers
+        else ""
+    )
     console.data(
-        f"N_p = {resources.workers}, T_n = {resources.latency_s * 1e3:.3g} ms ({latency_source}), "
+        f"N_p = {feasibility.workers}{fewer}, T_n = {resources.latency_s * 1e3:.3g} ms ({latency_source}), "
         f"B_n = {resources.bandwidth_bytes_s * BITS_PER_BYTE / 1e6:g} Mbit/s, compute times {compute}"
     )
     console.data(verdict_words(feasibility, capacity))
 
 
+def _compute_words(feasibility: Feasibility) -> str:
+    """Say where compute times are from, and T_p(S_b) of how many agents at once: it is less of each of more."""
+    if not feasibility.measured:
+        return "declared"
+    has_batches = any(item.number == "2.7" and item.applies for item in feasibility.inequalities)
+    of = f", T_p(S_b) with {counted(feasibility.agents, 'agent')} at once" if has_batches else ""
+    return f"measured here{of}"
+
+
 def verdict_words(feasibility: Feasibility, capacity: Capacity | None = None) -> str:
-    """Say whether the agents keep real time, and what limits their number; *capacity* is the prediction that stands above."""
+    """Say whether the agents keep real time, and what limits their number; *capacity* is the prediction, if there is one."""
     agents, binding = counted(feasibility.agents, "agent"), feasibility.binding
     if not feasibility.holds:
         return f"{agents} cannot keep real time: {broken_words(feasibility)}"

@@ -15,11 +15,14 @@ from cosmos_cli.fleet.helper import Helper
 from cosmos_cli.fleet.liveness import SilenceWatch
 from cosmos_cli.fleet.outcome import Outcome, failure_teller
 from cosmos_cli.fleet.target import target_of
+from cosmos_cli.launch.capacity import Capacity, predict_capacity
+from cosmos_cli.launch.capacity_view import computers_of
 from cosmos_cli.launch.feasibility import Feasibility, Resources
 from cosmos_cli.launch.plan import LaunchPlan
 from cosmos_cli.launch.plan_view import (
     LOCKSTEP_WORDS,
     broken_words,
+    demand_of,
     feasibility_of,
     latency_of,
     resources_of,
@@ -208,6 +211,8 @@ class RehearsedPace:
 
     feasibility: Feasibility | None = None
     """None in lockstep, and where it is not known."""
+    capacity: Capacity | None = None
+    """Prediction of processors and buffers as well; None where there is no feasibility."""
     resources: Resources
     latency_source: str
     is_lockstep: bool
@@ -229,7 +234,13 @@ class RehearsedPace:
         if self.is_lockstep:
             console.data(LOCKSTEP_WORDS)
         elif not self.unknown:
-            show_feasibility(console, self.feasibility, self.resources, self.latency_source)
+            show_feasibility(
+                console,
+                self.feasibility,
+                self.resources,
+                self.latency_source,
+                capacity=self.capacity,
+            )
 
 
 def pace_of(rehearsal: Rehearsal, outcomes: Sequence[Outcome[MachineRehearsal]]) -> RehearsedPace:
@@ -244,15 +255,21 @@ def pace_of(rehearsal: Rehearsal, outcomes: Sequence[Outcome[MachineRehearsal]])
     else:
         given_ms = rehearsal.scenario.scenario.plan.latency_ms
         latency_s, source = latency_of(rehearsal.plan, given_ms=given_ms)
-    resources = resources_of(rehearsal.scenario, latency_s)
-    feasibility, unknown = None, ""
+    resources = resources_of(rehearsal.scenario, rehearsal.plan, latency_s)
+    feasibility, capacity, unknown = None, None, ""
     if not rehearsal.plan.is_lockstep:
         try:
-            feasibility = feasibility_of(rehearsal.scenario, resources)
+            demand = demand_of(rehearsal.scenario)
+            if demand is not None:
+                feasibility = feasibility_of(rehearsal.scenario, resources, demand)
+                computers = computers_of(rehearsal.plan)
+                scenario = rehearsal.scenario.scenario
+                capacity = predict_capacity(scenario, demand, computers, resources)
         except (CosmosError, MadnsError) as error:
             unknown = str(error)  # a run does not ask it
     return RehearsedPace(
         feasibility=feasibility,
+        capacity=capacity,
         resources=resources,
         latency_source=source,
         is_lockstep=rehearsal.plan.is_lockstep,

@@ -15,24 +15,22 @@ from madns_runtime.hardware.stream_schemas import DEVICE_CLOCK, DEVICE_STATE, sc
 from madns_runtime.plugin.api import DeclaredStream
 from madns_runtime.recording.records import (
     AGENT_EVENT_WORDS,
-    CLOCK,
     DEVICE_EVENT_WORDS,
     EVENT_WORDS,
     EVENTS,
-    HEALTH,
+    FRAMEWORK_SCHEMAS,
     HOST_EVENT_WORDS,
-    LATE_TICKS,
     LOG,
     LOG_LEVELS,
     NUMBER_KINDS,
-    PROCESS,
-    TICKS,
     Field,
 )
 from madns_runtime.units import conversion
 
-REAL_TIME_ONLY = tuple(schema.name for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS, HEALTH))
-"""Framework streams that no run in lockstep records: no time passes there that could be late."""
+REAL_TIME_ONLY = tuple(
+    name for name, schema in FRAMEWORK_SCHEMAS.items() if schema.is_real_time_only
+)
+"""Framework streams that no run in lockstep records."""
 NOT_A_VALUE = ("json", "packed")
 OF_DEVICES_OWN = (DEVICE_STATE, DEVICE_CLOCK, EVENTS, LOG)
 """Streams of a device beside its channels: how it fares, not what it measures."""
@@ -96,17 +94,10 @@ class KnownDevice:
         ]
 
 
-FRAMEWORK = (
-    *(
-        KnownStream(role="agent", name=schema.name, fields=schema.fields)
-        for schema in (TICKS, LATE_TICKS, CLOCK, PROCESS)
-    ),
-    *(
-        KnownStream(role=role, name=schema.name, fields=schema.fields, is_open=schema is EVENTS)
-        for schema in (EVENTS, LOG)
-        for role in ("agent", "host")
-    ),
-    KnownStream(role="machine", name=HEALTH.name, fields=HEALTH.fields),
+FRAMEWORK = tuple(
+    KnownStream(role=role, name=schema.name, fields=schema.fields, is_open=schema is EVENTS)
+    for schema in FRAMEWORK_SCHEMAS.values()
+    for role in schema.roles
 )
 
 

@@ -24,6 +24,7 @@ from madns_runtime.hardware.kinds.playback import HEAD, OUTPUT_HEAD, streams_of
 from madns_runtime.plain_values import is_real
 from madns_runtime.recording.reader import read_stream
 from madns_runtime.recording.records import EVENTS
+from madns_runtime.recording.stream_file import files_of
 
 SAME_TIME_S: Final = 1.5e-6
 """Times are recorded in whole microseconds."""
@@ -85,26 +86,19 @@ def compare_devices(
     """
     found = []
     for used in recorded.devices:
-        for channel, path in streams_of(used.folder):
+        played = rerun / "devices" / used.agent / used.name
+        for channel, _ in streams_of(used.folder):
             if channel.direction == "out" and not used.may_write:
                 continue
-            played = rerun / "devices" / used.agent / used.name / path.name
-            found.append(
-                _compare(recorded, used, channel, path, played, is_early=used.agent in ends)
-            )
+            found.append(_compare(recorded, used, channel, played, is_early=used.agent in ends))
     return found
 
 
-def _compare(  # noqa: PLR0913 - both sides of one channel
-    recorded: FlownRun,
-    used: UsedDevice,
-    channel: Channel,
-    path: Path,
-    played: Path,
-    *,
-    is_early: bool,
+def _compare(
+    recorded: FlownRun, used: UsedDevice, channel: Channel, played: Path, *, is_early: bool
 ) -> ChannelComparison:
-    a, b = _rows(path), _rows(played)
+    """Compare one channel with what is in the folder of its device in the rerun."""
+    a, b = _rows(used.folder, channel.name), _rows(played, channel.name)
     agent = recorded.agents[used.agent]
     if channel.direction == "in":
         kept = [row for row in a if None not in row[len(HEAD) :]]
@@ -161,7 +155,7 @@ def _told_times(folder: Path, channel: Channel) -> tuple[list[float], list[float
     """Return when a device's events tell that an output refused values, that its profile had run out, and of faults, s."""
     refused = re.compile(rf"(?:[^\s:]+: )?{re.escape(channel.name)}: ")
     times: tuple[list[float], list[float], list[float]] = ([], [], [])
-    for event in _rows(folder / f"{EVENTS.name}.jsonl"):
+    for event in _rows(folder, EVENTS.name):
         told: Mapping[str, Any] = event if isinstance(event, Mapping) else {}
         t_s = told.get("t_s")
         if not is_real(t_s):
@@ -254,8 +248,9 @@ def _count_in_ticks(agent: RecordedAgent, rows: Sequence[Row]) -> int:
     return count
 
 
-def _rows(path: Path) -> list[Row]:
-    return list(read_stream(path).records()) if path.is_file() else []
+def _rows(folder: Path, stream: str) -> list[Row]:
+    """Return the records of a stream, those of all processes that the device had."""
+    return [row for path in files_of(folder, stream) for row in read_stream(path).records()]
 
 
 def _in_order(a: Sequence[Row], b: Sequence[Row]) -> list[Pair]:

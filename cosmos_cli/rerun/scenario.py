@@ -26,9 +26,11 @@ from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
 from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.kinds.playback import streams_of
+from madns_runtime.hardware.stream_schemas import DEVICE_STATE
 from madns_runtime.plugin.queries import ask_rerun
 from madns_runtime.plugin.registry import is_file, is_shipped, parse_parameters, resolve
 from madns_runtime.recording.reader import read_stream
+from madns_runtime.recording.stream_file import files_of
 
 PLAYBACK: Final = "playback"
 TICKS: Final = ("ticks", "tick_hz", "phase_s")
@@ -216,6 +218,12 @@ def _devices(recorded: FlownRun, remarks: list[str]) -> tuple[ScenarioDevice, ..
             answer = None
             remarks.append(
                 f"{used.full_name}: its channels' limits are not on record: outputs are put out as they are given"
+            )
+        anew = len(files_of(used.folder, DEVICE_STATE.name)) - 1
+        if anew > 0:
+            remarks.append(
+                f"{used.full_name}: its process was started anew, {counted(anew, 'time')}: what an earlier one had not"
+                " written when it ended is in no rerun"
             )
         found.append(_player(recorded, used, device, answer, remarks))
     return tuple(found)

@@ -9,6 +9,8 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from madns_runtime.signal_names import signal_name
+
 
 def path_word(path: Path) -> str:
     """Return a path as a word of a command line, where one that begins with a dash would be an option."""
@@ -56,7 +58,4 @@ def describe_exit(returncode: int) -> str:
     """Return how a process ended, from subprocess's return code."""
     if returncode >= 0:
         return f"exited with code {returncode}"
-    try:
-        return f"was killed by {signal.Signals(-returncode).name}"
-    except ValueError:
-        return f"was killed by signal {-returncode}"
+    return f"was killed by {signal_name(-returncode)}"

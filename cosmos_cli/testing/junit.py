@@ -8,7 +8,6 @@ and bounded.
 from __future__ import annotations
 
 import os
-from codecs import BOM_UTF8
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +17,12 @@ from xml.etree import ElementTree
 import typer
 
 from cosmos_cli.errors import ExitCode, InputError
+from cosmos_cli.system.named_file import JUNIT, check_no_other
 from cosmos_cli.testing.check_lines import broken_checks, check_line
 from cosmos_cli.ui.foreign_text import clean_line, clean_text
 from madns_runtime.partial_file import check_replaceable, write_whole
 
 SUITE: Final = "cosmos"
-START_BYTES_MAX: Final = 1000
-"""Of an earlier file, to tell whether it is XML."""
 TEXT_CHARACTERS_MAX: Final = 20_000
 MESSAGE_CHARACTERS_MAX: Final = 1000
 
@@ -112,7 +110,7 @@ def prepare_junit(path: Path | None) -> None:
     Make the folders above the file and remove an earlier one, whose results would be taken for those that are to come.
 
     Raises:
-        InputError: It could not be written, or what is there is no XML, such as the scenario of who left FILE out.
+        InputError: It could not be written, or what is there is no JUnit XML, such as the scenario of who left FILE out.
     """
     if path is None:
         return
@@ -124,14 +122,8 @@ def prepare_junit(path: Path | None) -> None:
     if not os.access(path.parent, os.W_OK):
         raise _unwritable(path, f"no right to write in {path.parent}")
     try:
-        if path.exists():
-            with path.open("rb") as stream:
-                start = stream.read(START_BYTES_MAX).removeprefix(BOM_UTF8).lstrip()
-            if start and not start.startswith(b"<"):
-                raise _unwritable(
-                    path, "what is there is no XML, and would be lost; name another file"
-                )
-            path.unlink()
+        check_no_other(path, JUNIT)
+        path.unlink(missing_ok=True)
     except OSError as error:
         raise _unwritable(path, error.strerror) from error
 

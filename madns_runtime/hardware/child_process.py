@@ -54,27 +54,35 @@ def is_there(pid: int) -> bool:
     return True
 
 
-def wait_for(pid: int, deadline_s: float) -> bool:
-    """Wait until a child has ended, and return whether it has; 0 is a child that was never there."""
+def wait_for(pid: int, deadline_s: float) -> int | None:
+    """
+    Wait until a child has ended, and return its exit code; None if it lives.
+
+    Args:
+        pid: Of the child; 0 is one that was never there, whose exit code is 0, as is that of one let go of before.
+        deadline_s: Until when to wait, monotonic, s.
+    """
     if not pid:
-        return True
+        return 0
     try:
         fd = os.pidfd_open(pid)
     except OSError:  # ended and reaped; or there is no descriptor, and its end has to be looked for
-        while not _has_ended(pid) and monotonic() < deadline_s:
+        while (code := _exit_code(pid)) is None and monotonic() < deadline_s:
             sleep(LOOK_S)
-        return _has_ended(pid)
+        return code
     try:
         poll = select.poll()
         poll.register(fd, select.POLLIN)
         poll.poll(max(0.0, deadline_s - monotonic()) * 1e3)
     finally:
         os.close(fd)
-    return _has_ended(pid)
+    return _exit_code(pid)
 
 
-def _has_ended(pid: int) -> bool:
-    """Tell whether a child has ended, and let go of it; so has one that was let go of before."""
-    with contextlib.suppress(ChildProcessError):
-        return os.waitpid(pid, os.WNOHANG)[0] != 0
-    return True
+def _exit_code(pid: int) -> int | None:
+    """Return the exit code of a child that has ended, and let go of it; None if it lives."""
+    try:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+    except ChildProcessError:
+        return 0
+    return os.waitstatus_to_exitcode(status) if ended else None

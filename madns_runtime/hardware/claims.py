@@ -2,8 +2,9 @@
 Claims on a machine's devices: two runs that open the same one would spoil each other's reads and outputs.
 
 A claim is a lock on files in the machine's state folder: one of the device, and one of each part of the machine that its
-kind needs for itself alone, so that the same chip is refused under another name as well. Processes that are forked
-afterwards hold it, too, so that it lasts until the last one that has the device open is gone, however it ended.
+kind needs for itself alone, so that the same chip is refused under another name as well. The processes that drive the
+device and make it safe keep the descriptors, so that it lasts until the last one that has the device open is gone,
+however it ended.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ class DeviceClaims:
         self.problem = ""
         """Why claims cannot be kept here, which is no reason to fail; empty where they can."""
 
-    def claim(self, device: DeviceLaunch, kind: DeviceKind, exclusive: Sequence[str] = ()) -> None:
+    def claim(
+        self, device: DeviceLaunch, kind: DeviceKind, exclusive: Sequence[str] = ()
+    ) -> frozenset[int]:
         """
         Claim a device of the machine; one of a kind that needs no hardware is open to all.
 
@@ -54,26 +57,31 @@ class DeviceClaims:
             kind: Of it.
             exclusive: Parts of the machine, see `Needs`; several devices of this run may have the same.
 
+        Returns:
+            Its descriptors: a forked process that opens the device keeps them, else its claim ends before it does.
+
         Raises:
             MachineError: Another run has it.
         """
         if not kind.needs_hardware:
-            return
+            return frozenset()
+        held: set[int] = set()
         for path, part in [
             (claim_path(device), ""),
             *((_path_of(["part", part]), part) for part in sorted(exclusive)),
         ]:
-            if path in self._descriptors:
-                continue
-            try:
-                descriptor = _open(path)
-            except OSError as error:
-                self.problem = (
-                    f"other runs are not kept from its devices: {error.strerror or error}"
-                )
-                return
-            self._lock(descriptor, device.full_name, part)
-            self._descriptors[path] = descriptor
+            if path not in self._descriptors:
+                try:
+                    descriptor = _open(path)
+                except OSError as error:
+                    self.problem = (
+                        f"other runs are not kept from its devices: {error.strerror or error}"
+                    )
+                    break
+                self._lock(descriptor, device.full_name, part)
+                self._descriptors[path] = descriptor
+            held.add(self._descriptors[path])
+        return frozenset(held)
 
     def _lock(self, descriptor: int, device: str, part: str) -> None:
         """
@@ -103,7 +111,7 @@ class DeviceClaims:
             emit({"event": "log", "level": "warning", "text": self.problem})
 
     def release(self) -> None:
-        """Give up what this process claims; harmless when repeated."""
+        """Give up what this process claims, whatever others still hold; harmless when repeated."""
         for descriptor in self._descriptors.values():
             os.close(descriptor)
         self._descriptors = {}

@@ -260,6 +260,9 @@ class DeviceKind:
 class SimulatedDevice(Device):
     """A device whose values depend on simulated time alone: the same in real time and in lockstep."""
 
+    is_finite = False
+    """Whether its samples come to an end by themselves, as a recording's do: any number of them may be of one time."""
+
     def sample_at(self, t_s: float) -> Sample | None:
         """
         Return what it measures at simulated time *t_s*, s; None if there is nothing new.

@@ -6,7 +6,7 @@ from typing import Final
 
 from madns_runtime.errors import PluginError
 
-CELLS_MAX: Final = 1024
+CELLS_MAX: Final = 1280
 """Names of one device: all that is counted of 64 channels, and of agents. What is counted under more is counted under REST."""
 NUMBER_MAX: Final = 1e15
 """Counted at once: whole numbers of a float64 reach further, and sums of them do."""
@@ -17,6 +17,8 @@ CELL_BYTES: Final = NAME_BYTES + 8
 TABLE_BYTES: Final = CELLS_MAX * CELL_BYTES
 NOT_FINITE: Final = "_not_finite"
 """Behind an input's name: how often it was no number."""
+BEYOND_LIMITS: Final = "_beyond_limits"
+"""Behind an input's name: how often it was beyond its limits, and is handed on as it is."""
 MISSED: Final = "missed:"
 """Before an agent's name: how many messages were given up that it did not take."""
 

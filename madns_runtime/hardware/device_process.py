@@ -17,6 +17,7 @@ from madns_runtime.hardware import messages
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.runner import DeviceRunner
 from madns_runtime.hardware.seat import DeviceSeat
+from madns_runtime.plugin.code_places import error_text
 from madns_runtime.plugin.isolation import said
 from madns_runtime.reactor.forking import leave_parent
 from madns_runtime.reactor.reactor import Reactor
@@ -48,13 +49,15 @@ def run_devices(
     code = 1
     try:
         users = {end.fileno() for seat in seats for end in seat.users.values()}
-        leave_parent(keep={control.fileno(), *users})
+        claims = frozenset[int]().union(*(seat.claims for seat in seats))
+        leave_parent(keep={control.fileno(), *users, *claims})
         report = DeviceLoop(seats, control, config, directory).run()
         for part in messages.in_parts(REPORT, report):
             messages.send(control, part)
         code = 0
     except BaseException as error:  # noqa: BLE001 - the last frame of a process
-        messages.send(control, [GONE, str(error) if isinstance(error, MadnsError) else said(error)])
+        why = error_text(error) if isinstance(error, MadnsError) else said(error)
+        messages.send(control, [GONE, why])
         traceback.print_exception(error)
     finally:
         os._exit(code)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -23,6 +22,7 @@ from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.status import StatusAccount, StatusLimits, limits_of, sample_period_s
 from madns_runtime.reactor.descriptors import allow_descriptors, ready
+from madns_runtime.signal_names import signal_name
 
 NOT_MADE_SAFE: Final = "could not be made safe: its driver failed, look at the device"
 DESCRIPTORS_BESIDE: Final = 256
@@ -56,8 +56,10 @@ class DrivenDevice:
     """Why it was lost the last time."""
 
     @classmethod
-    def share(cls, launch: DeviceLaunch, program: DeviceProgram) -> DrivenDevice:
-        """Make what a device and its users share; before anybody is forked."""
+    def share(
+        cls, launch: DeviceLaunch, program: DeviceProgram, claims: frozenset[int] = frozenset()
+    ) -> DrivenDevice:
+        """Make what a device and its users share, beside its claims' descriptors; before anybody is forked."""
         pairs = {agent: messages.make_pair() for agent in launch.users}
         seat = DeviceSeat(
             launch=launch,
@@ -65,6 +67,7 @@ class DrivenDevice:
             channels=program.channels,
             page=DevicePage([c for c in program.channels if c.direction == "in"]),
             users={agent: pair[1] for agent, pair in pairs.items()},
+            claims=claims,
         )
         return cls(
             seat=seat,
@@ -192,6 +195,12 @@ class DeviceProcess:
         """Send it a message; False if it does not listen."""
         return self.control is not None and messages.send(self.control, message)
 
+    def note_exit(self, code: int) -> None:
+        """Blame it, when the run is over, for an end otherwise than in good order: not with 0, or without its report."""
+        for driven in self.devices:
+            if code or driven.report is None:
+                driven.blame(self.gave_up_why or exit_text(code))
+
     def has_words(self) -> bool:
         """Tell whether it has said something that nobody has heard, or has closed its end."""
         return self.control is not None and bool(ready([self.control.fileno()], [], 0)[0])
@@ -212,4 +221,4 @@ def allow_descriptors_of(devices: Iterable[DeviceLaunch]) -> None:
 
 def exit_text(code: int) -> str:
     """Return how a process ended, in words."""
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+    return f"killed by {signal_name(-code)}" if code < 0 else f"exit code {code}"

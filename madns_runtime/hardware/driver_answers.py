@@ -8,15 +8,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from madns_runtime.errors import MachineError, PluginError
+from madns_runtime.plugin.code_places import error_text
 from madns_runtime.plugin.context import clean_text, describe_exception
 
 
 def describe_fault(error: BaseException, where: str, called: Any = None) -> str:
     """Return in words what a driver's method *called* raised, or that its answer was refused; *where* names it."""
     if isinstance(error, MachineError):
-        return clean_text(str(error))
+        return clean_text(error_text(error))
     if isinstance(error, PluginError):
-        return f"{where}: {clean_text(str(error))}"
+        return f"{where}: {clean_text(error_text(error))}"
     return describe_exception(error, where, called)
 
 

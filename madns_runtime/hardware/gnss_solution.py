@@ -2,11 +2,13 @@
 One solution of a GNSS receiver: where, how fast and when, in the forms that its messages want. Pure.
 
 Times are UTC as seconds since 1970 without leap seconds (Unix time); GPS time is ahead of UTC by the leap seconds since 1980.
+A leap second itself has no Unix time: over one, GPS time goes on by a second more than UTC.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,6 +19,16 @@ WGS_84_FLATTENING: Final = 1.0 / 298.257_223_563
 E2: Final = WGS_84_FLATTENING * (2.0 - WGS_84_FLATTENING)
 GPS_EPOCH_UNIX_S: Final = 315_964_800
 """1980-01-06 00:00:00 UTC, when GPS time began."""
+LEAP_SECONDS_UTC: Final = (
+    *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01"),
+    *("1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01"),
+    *("1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
+)
+"""Days before which a leap second was put in since GPS time began. Source: IERS, Bulletins C up to 52; none since has one."""
+LEAP_SECONDS_UNIX_MS: Final = tuple(
+    1000 * round(datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp())
+    for day in LEAP_SECONDS_UTC
+)
 WEEK_MS: Final = 604_800_000
 ITERATIONS_MAX: Final = 12
 TIME_ERROR_S: Final = 1e-6
@@ -38,10 +50,11 @@ class GnssSolution:
     """Earth-fixed."""
 
     @classmethod
-    def of(cls, values: Sequence[float], leap_s: int) -> GnssSolution:
+    def of(cls, values: Sequence[float], leap_s: int | None = None) -> GnssSolution:
         """
         Return the solution of a point: UTC (Unix time, s), position, m, velocity, m/s.
 
+        Without *leap_s*, GPS time is ahead of UTC by what it was then: 0 s before July 1981, 18 s from 2017 on.
         It is brought to the nearest whole millisecond by its velocity: in half of one, gravity moves it by 1 um. Times
         that differ from one by less than a float of today's date can tell are on it.
         """
@@ -50,6 +63,8 @@ class GnssSolution:
         step_s = utc_ms * 1e-3 - utc_s
         if abs(step_s) < TIME_ERROR_S:
             step_s = 0.0
+        if leap_s is None:
+            leap_s = bisect_right(LEAP_SECONDS_UNIX_MS, utc_ms)
         position_m = (x + vx * step_s, y + vy * step_s, z + vz * step_s)
         return cls(utc_ms=utc_ms, leap_s=leap_s, position_m=position_m, velocity_m_s=(vx, vy, vz))
 

@@ -54,7 +54,8 @@ def guard_outputs(seats: Mapping[str, DeviceSeat], control: socket.socket) -> No
     """
     code = 1
     try:
-        leave_parent(keep={control.fileno()})
+        claims = frozenset[int]().union(*(seat.claims for seat in seats.values()))
+        leave_parent(keep={control.fileno(), *claims})
         os.setsid()  # what ends the supervisor's group leaves the guardian to its work
         Guardian(seats, control).run()
         code = 0
@@ -267,7 +268,7 @@ def _open_and_make_safe(seat: DeviceSeat, line: socket.socket) -> None:
     """Make the driver, wait for the word, do it, and say so when it is done; ends the process."""
     try:
         die_with_parent()
-        leave_parent(keep={line.fileno()})
+        leave_parent(keep={line.fileno(), *seat.claims})
         device = seat.make()
         if not line.recv(1):
             return  # the guardian has ended, and all is safe

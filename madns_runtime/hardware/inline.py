@@ -20,6 +20,7 @@ from madns_runtime.hardware.port import DevicePort
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.simulated import TimeProgress, next_of
 from madns_runtime.hardware.status import StatusAccount, limits_of
+from madns_runtime.plugin.code_places import error_text
 from madns_runtime.plugin.context import describe_exception
 
 RECORDS_TIMEOUT_S: Final = 10.0
@@ -62,10 +63,10 @@ class InlineDevice:
         self._account = StatusAccount()
         self._rate_hz = launch.rate_hz
         self._count = 0
-        self._progress = TimeProgress()
+        self._progress = TimeProgress(device)
         self._launch = launch
         self._why = ""
-        """Words for what its driver raised at the end, or why it was lost before."""
+        """Words for what its driver raised last, or why it was lost before."""
         self._failure: PluginError | None = None
         """Error of its driver while its agent took no step."""
         self._handed_s = 0.0
@@ -98,9 +99,18 @@ class InlineDevice:
         return True
 
     def open(self) -> None:
-        """Open it at simulated time 0, or where that is over, in an agent's return to another process, at the present."""
+        """
+        Open it at simulated time 0, or where that is over, in an agent's return to another process, at the present.
+
+        Raises:
+            PluginError: The driver raised, or its identity is none.
+        """
         now_s = self._handed_s = max(self._now_s(), 0.0)
-        identity = identity_of(self._call("open", self._device.open))
+        try:
+            identity = identity_of(self._call("open", self._device.open))
+        except PluginError as error:
+            self._note_error(str(error))
+            raise
         header = self._page.header
         header[page.STATE], header[page.OPENED_S] = page.OPEN, now_s
         self._records.time.set(0.0, 0.0, 1.0)
@@ -129,6 +139,13 @@ class InlineDevice:
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure
+        try:
+            self._advance(t_s)
+        except PluginError as error:
+            self._note_error(str(error))
+            raise
+
+    def _advance(self, t_s: float) -> None:
         self._hear()
         while True:
             next_s = self._call("next_s", next_of, self._device)
@@ -163,7 +180,6 @@ class InlineDevice:
             self.advance(t_s)
         except PluginError as error:
             self._failure = error
-            self._note_error(str(error))
 
     def owner_gone(self) -> None:
         """Make it safe: the agent that moves it has ended, and what that last said is not carried out."""
@@ -230,7 +246,7 @@ class InlineDevice:
             if not isinstance(error.__cause__, PluginError):
                 raise
             self._outputs.note_refused(output)
-            why = f"{output.channel.name}: {error.__cause__}"
+            why = f"{output.channel.name}: {error_text(error.__cause__)}"
             self._intake.event("refused", now_s, why=why)
             return
         self._records.written(output.channel.name, output.due_s, now_s, output.told)
@@ -279,7 +295,7 @@ class InlineDevice:
         """
         try:
             return call(*arguments)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             text = describe_exception(error, f"{type(self._device).__name__}.{method}", call)
             raise BlamedError(f"device {self.name}: {text}") from error
 
@@ -316,6 +332,6 @@ def _made(launch: DeviceLaunch, program: DeviceProgram) -> Device:
         return program.make()
     except MadnsError:
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         text = describe_exception(error, f"{launch.kind}.__init__")
         raise BlamedError(f"device {launch.name}: {text}") from error

@@ -11,7 +11,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware import messages, page
 from madns_runtime.hardware.clock import DeviceClock
 from madns_runtime.hardware.contract import Channel, Device, Sample
-from madns_runtime.hardware.count_table import MISSED, NOT_FINITE
+from madns_runtime.hardware.count_table import BEYOND_LIMITS, MISSED, NOT_FINITE
 from madns_runtime.hardware.fault_actions import check_fault_fits
 from madns_runtime.hardware.faults import InsertedFaults
 from madns_runtime.hardware.page import DevicePage
@@ -23,6 +23,8 @@ from madns_runtime.plain_values import is_real
 
 FROZEN: Final = "frozen:"
 """Before an input's name: how often it stood still."""
+AGE_S_MAX: Final = 1e9
+"""Of a sample: 30 years, which no machine has been running for."""
 EVENTS_MAX: Final = 1000
 """Of one kind of event, such as refused values; more are counted alone."""
 
@@ -36,7 +38,7 @@ class Intake:
         device_page: Its page.
         records: Its records.
         seed: Of inserted faults.
-        frozen_s: By input: values unchanged for so long are frozen.
+        frozen_s: By input: one that has not changed for so long, or not come, is frozen.
         pass_on: Sends a message to all agents that use it, and returns how many had no room.
         handed_s: Of the time at which a sample was taken up, returns when agents have it: asked right after
             it was handed over, for which a busy machine may take its time. In lockstep no time passes.
@@ -182,15 +184,17 @@ class Intake:
                 continue
             is_told = True
             if channel.limits is not None and hold_to_limits(channel, numbers)[1]:
-                self.count(f"{name}_beyond_limits")
+                self.count(f"{name}{BEYOND_LIMITS}")
             number = self._page.write(name, sample.taken_s, device_s, numbers)
             if channel.passing == "queue":
                 self._send([messages.FRAME, name, number, sample.taken_s, list(numbers)])
             told_s = self._handed_s(now_s)
             self._records.sample(name, number, sample.taken_s, numbers, told_s=told_s)
-            self._look_for_change(name, numbers, now_s)
+            self._note_change(name, numbers, now_s)
         if not is_told:
             return
+        if self._changes:
+            self._look_for_frozen(now_s)
         header = self._page.header
         header[page.NEWEST_S] = max(header[page.NEWEST_S], sample.taken_s)
         header[page.ARRIVED_S] = now_s
@@ -200,14 +204,27 @@ class Intake:
         told = (len(data), data.hex())
         self._send([messages.FRAME, channel.name, number, taken_s, data])
         self._records.sample(channel.name, number, taken_s, told, told_s=self._handed_s(now_s))
-        self._look_for_change(channel.name, (data,), now_s)
+        self._note_change(channel.name, (data,), now_s)
 
-    def _look_for_change(self, name: str, values: tuple[Any, ...], now_s: float) -> None:
-        """Count and record an input that has not changed for too long."""
-        change = self._changes.get(name)
-        if change is not None and change.is_frozen(values, now_s):
-            self.count(f"{FROZEN}{name}")
-            self.event("frozen", now_s, channel=name, for_s=change.limit_s)
+    def _note_change(self, name: str, values: tuple[Any, ...], now_s: float) -> None:
+        if (change := self._changes.get(name)) is not None:
+            change.note(values, now_s)
+
+    def _look_for_frozen(self, now_s: float) -> None:
+        """
+        Count and record the inputs that have not changed for too long, though the device gave something right now.
+
+        One that ceases to come has not changed either, nor has one that never came. Time counts from the device's opening
+        on, and within simulated time: before it a recording gives nothing. A device that is silent altogether is stale, or lost.
+        """
+        time = self._records.time
+        if not 0.0 <= time.at(now_s) <= time.end_s:
+            return
+        begun_s = max(self._page.header[page.OPENED_S], time.local_s(0.0))
+        for name, change in self._changes.items():
+            if change.is_frozen(now_s, begun_s):
+                self.count(f"{FROZEN}{name}")
+                self.event("frozen", now_s, channel=name, for_s=change.limit_s)
 
     def _send(self, message: list[Any]) -> None:
         self.count("frames_missed", self._pass_on(message))
@@ -215,16 +232,16 @@ class Intake:
 
 def _check_times(sample: Sample, latest_s: float, now_s: float) -> None:
     """
-    Refuse a sample whose times are none, or still to come.
+    Refuse a sample whose times are none, still to come, or so long ago that its age has no room on record.
 
     Raises:
         PluginError: They are.
     """
     taken_s: Any = sample.taken_s
-    if not is_real(taken_s) or not math.isfinite(taken_s) or taken_s > latest_s:
+    if not is_real(taken_s) or not now_s - AGE_S_MAX <= taken_s <= latest_s:
         raise PluginError(
-            f"taken_s: expected a time until now, {now_s:.6f} s of time.monotonic() (in lockstep simulated), got"
-            f" {taken_s!r:.80}"
+            f"taken_s: expected a time until now, {now_s:.6f} s of time.monotonic() (in lockstep simulated), and at most"
+            f" {AGE_S_MAX:g} s before it, got {taken_s!r:.80}"
         )
     device_s: Any = sample.device_s
     if device_s is not None and not is_real(device_s):
@@ -272,15 +289,17 @@ class _LastChange:
     def __init__(self, limit_s: float) -> None:
         self.limit_s = limit_s
         self._values: tuple[Any, ...] | None = None
-        self._since_s = 0.0
+        self._since_s = -math.inf
         self._is_told = False
 
-    def is_frozen(self, values: tuple[Any, ...], now_s: float) -> bool:
-        """Take note of values, and return whether they are now, and were not before, unchanged for too long."""
+    def note(self, values: tuple[Any, ...], now_s: float) -> None:
+        """Take note of values that came."""
         if values != self._values:
             self._values, self._since_s, self._is_told = values, now_s, False
-            return False
-        if self._is_told or now_s - self._since_s < self.limit_s:
+
+    def is_frozen(self, now_s: float, begun_s: float) -> bool:
+        """Return whether there is now, and was not before, no change for too long; time before *begun_s* does not count."""
+        if self._is_told or now_s - max(self._since_s, begun_s) < self.limit_s:
             return False
         self._is_told = True
         return True

@@ -76,8 +76,8 @@ class DeviceManager:
         for each in launch.devices:
             tell(f"importing the kind of device {each.kind}")
             program = prepare(each.kind, each.parameters, Path(each.base_directory))
-            self._claims.claim(each, program.kind, program.needs.exclusive)
-            driven = DrivenDevice.share(each, program)
+            claims = self._claims.claim(each, program.kind, program.needs.exclusive)
+            driven = DrivenDevice.share(each, program, claims)
             self._devices[driven.name] = driven
             if program.kind.can_block:
                 self._processes.append(DeviceProcess([driven]))
@@ -286,8 +286,8 @@ class DeviceManager:
                 driven.blame(process.killed_why or process.gave_up_why or exit_text(code))
                 driven.loss = driven.why
                 self._look_at(process, driven, monotonic())
-            elif code:
-                driven.blame(process.gave_up_why or exit_text(code))
+        if self._is_ending:
+            process.note_exit(code)
         if self._is_ending or self._reactor is None:
             return
         process.failures = 0 if monotonic() - process.started_s > 10.0 else process.failures + 1
@@ -384,13 +384,16 @@ class DeviceManager:
         return {name: driven.close() for name, driven in self._devices.items()}
 
     def _wait(self, process: DeviceProcess, deadline_s: float) -> None:
-        if process.pid and not wait_for(process.pid, deadline_s):
+        code = wait_for(process.pid, deadline_s)
+        if code is None:
             kill(process.pid)
             wait_for(process.pid, monotonic() + KILL_WAIT_S)
             for driven in process.devices:
                 driven.blame(f"its driver did not return within {END_S:g} s of the run's end")
                 text = f"{driven.name}: {driven.why}"
                 self._emit({"event": "log", "level": "error", "text": text})
-        process.pid = 0
         self._hear(process)
         self._hang_up(process)
+        if process.pid and code is not None:
+            process.note_exit(code)
+        process.pid = 0

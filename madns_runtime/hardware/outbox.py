@@ -17,7 +17,7 @@ WAITING_MAX: Final = 10_000
 """Messages that may wait for room at one agent; the oldest is given up beyond, and counted."""
 PERIOD_S: Final = 0.02
 """Between two looks for room."""
-USERS_NAMED_MAX: Final = CELLS_MAX // 4
+USERS_NAMED_MAX: Final = CELLS_MAX // 5
 """Agents of which each has a count of its own; of more they are counted together, as a device's own counts need room."""
 
 

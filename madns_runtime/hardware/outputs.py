@@ -16,6 +16,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel
 from madns_runtime.hardware.pending import PendingWrites
 from madns_runtime.hardware.profiles import (
+    DECLINED,
     ChannelProfile,
     ProfilePoint,
     count_name,
@@ -216,7 +217,7 @@ class DeviceOutputs:
         if point is None:
             self._count("refused", 1)
         elif not point.is_underrun:
-            self._count(count_name("refused", point.channel.name), 1)
+            self._count(count_name(DECLINED, point.channel.name), 1)
 
     def clear_writes(self) -> int:
         """Forget all writes, and return how many: what was to come belongs to what is over."""

@@ -30,8 +30,9 @@ PointCount = Literal[
     "points", "played", "late", "came_late", "skipped", "replaced", "lost", "unplayed", "refused"
 ]
 """Of an output's points: handed over and taken; put out, those later than the run allows among them; that came after
-their time; overtaken by a later one that was due as well; replaced before their time; due while the device was closed;
-left when the run ended; refused (no right to move it, no room, no numbers)."""
+their time; overtaken by a later one that was due as well; replaced before their time; due while the device was closed,
+or waiting in a process that ended; left when the run ended; refused (no right to move it, no room, no numbers, or by
+the driver)."""
 POINT_COUNTS: Final[tuple[PointCount, ...]] = (
     "points",
     "played",
@@ -45,6 +46,8 @@ POINT_COUNTS: Final[tuple[PointCount, ...]] = (
 )
 UNDERRUNS: Final = "underruns"
 """How often a profile ran out: its newest point was followed by none."""
+DECLINED: Final = "declined"
+"""Points, taken, that the driver refused; told with those that were `refused`."""
 PREFIX: Final = "play:"
 
 Points = Iterable[tuple[float, Sequence[float]]]
@@ -56,13 +59,22 @@ def count_name(word: str, channel: str) -> str:
 
 
 def counts_by_channel(counts: Mapping[str, int]) -> dict[str, dict[str, int]]:
-    """Return a device's counts of points by output, zeros with them; nothing of an output that played none."""
+    """
+    Return a device's counts of points by output, zeros with them; nothing of an output that played none.
+
+    To be asked when its last process has ended, or is about to: points of which nothing else became are lost with one.
+    """
     found: dict[str, dict[str, int]] = {}
     for name, number in counts.items():
         if name.startswith(PREFIX):
             word, _, channel = name.removeprefix(PREFIX).partition(":")
-            zeros = dict.fromkeys((*POINT_COUNTS, UNDERRUNS), 0)
+            zeros = dict.fromkeys((*POINT_COUNTS, UNDERRUNS, DECLINED), 0)
             found.setdefault(channel, zeros)[word] = number
+    for told in found.values():
+        declined = told.pop(DECLINED)
+        ends = ("played", "skipped", "replaced", "lost", "unplayed")
+        told["lost"] += max(0, told["points"] - sum(told[end] for end in ends) - declined)
+        told["refused"] += declined
     return found
 
 

@@ -22,6 +22,7 @@ from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.simulated import next_of, pass_over, samples_by_now
 from madns_runtime.hardware.status import LOST_PERIODS, back_off_s, limits_of, sample_period_s
+from madns_runtime.plugin.code_places import error_text
 from madns_runtime.reactor.reactor import Reactor
 
 BURST_MAX: Final = 256
@@ -125,12 +126,9 @@ class DeviceRunner:
 
     def _fail(self, method: str, error: BaseException) -> None:
         """Note what a driver raised, close the device, and open it anew after a while."""
-        if isinstance(error, KeyboardInterrupt | GeneratorExit):
-            raise error
         name = type(self._device).__name__ if self._device is not None else self._launch.kind
-        self.tell_error(self._blame(name, method, error, self._device))
+        self._blame(name, method, error, self._device)
         self._failures += 1
-        self._header[page.ERRORS] += 1
         self._close_device()
         if not has_descriptors():
             self._give_up(f"{name} leaks descriptors: none is left, so it gets a process anew")
@@ -147,16 +145,18 @@ class DeviceRunner:
         if not self.gave_up and (leak := leak_of(self._first_bytes)):
             self._give_up(f"{type(self._device).__name__} {leak}, so it gets a process anew")
 
-    def _blame(self, driver: str, method: str, error: BaseException, device: Any) -> str:
-        """Record what a driver's method raised, and return its words."""
+    def _blame(self, driver: str, method: str, error: BaseException, device: Any) -> None:
+        """Record, count and tell what a driver's method raised; but what follows a fault is not told over that."""
         self._reactor.end_if_forked()  # by sys.exit, say: whoever forked it goes on
         called = getattr(device, method, None)
         text = driver_answers.describe_fault(error, f"{driver}.{method}", called)
         self._intake.event("error", monotonic(), why=text)
-        return text
+        self._header[page.ERRORS] += 1
+        if not (self._failures and method in ("close", "make_safe")):
+            self.tell_error(text)
 
     def _close_device(self) -> None:
-        """Make the device safe and close it; what either raises is recorded."""
+        """Make the device safe and close it, whatever either raises."""
         device, self._device = self._device, None
         if device is None:  # it could not even be made, or is closed already
             self._header[page.STATE] = page.CLOSED
@@ -321,7 +321,7 @@ class DeviceRunner:
         try:
             device.write({name: output.value}, output.due_s)
         except PluginError as error:
-            self._refuse(f"{name}: {error}", output)
+            self._refuse(f"{name}: {error_text(error)}", output)
             return True
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
             self._outputs.note_lost(output)

@@ -23,6 +23,8 @@ class DeviceSeat:
     page: DevicePage
     users: Mapping[str, socket.socket]
     """The device's ends of the pairs that it shares with agents, by agent."""
+    claims: frozenset[int] = frozenset()
+    """Descriptors of the claims on it, which each process keeps that may open it."""
 
     def check_identity(self, identity: str) -> None:
         """

@@ -16,7 +16,7 @@ from madns_runtime.hardware.records import SimulatedTime
 AT_ONCE_S: Final = 0.01
 """Simulated time within which samples count as of one time, s: a driver that goes on by nanoseconds comes to no end either."""
 AT_ONCE_MAX: Final = 10_000
-"""Samples of one simulated time, in real time and in lockstep; a tick's watchdog waits for longer than they take."""
+"""Samples of one simulated time, unless they are finite; a tick's watchdog waits for longer than they take."""
 STANDS_STILL: Final = (
     "next_s() should tell of a later time once sample_at() has given what there was"
 )
@@ -46,8 +46,9 @@ def next_of(device: SimulatedDevice) -> float | None:
 class TimeProgress:
     """Sees to it that the times told by one device's `next_s` go on."""
 
-    def __init__(self) -> None:
+    def __init__(self, device: SimulatedDevice) -> None:
         self._since_s, self._count = -math.inf, 0
+        self._count_max = math.inf if device.is_finite else AT_ONCE_MAX
 
     def note(self, next_s: float) -> None:
         """
@@ -62,7 +63,7 @@ class TimeProgress:
         if next_s > self._since_s + AT_ONCE_S:
             self._since_s, self._count = next_s, 0
         self._count += 1
-        if self._count > AT_ONCE_MAX:
+        if self._count > self._count_max:
             raise PluginError(
                 f"more than {AT_ONCE_MAX} samples at {self._since_s:g} s: {STANDS_STILL}"
             )
@@ -85,7 +86,7 @@ def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) ->
     """
     if not isinstance(device, SimulatedDevice) or not time.is_known:
         return 0
-    t_s, passed, progress = time.at(monotonic()), 0, TimeProgress()
+    t_s, passed, progress = time.at(monotonic()), 0, TimeProgress(device)
     while (next_s := next_of(device)) is not None and next_s <= t_s:
         header[page.ACTIVE_S] = monotonic()
         progress.note(next_s)

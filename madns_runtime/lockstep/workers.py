@@ -23,6 +23,7 @@ from madns_runtime.lockstep.frames import METHODS, POSITIONS, FrameReader, encod
 from madns_runtime.lockstep.worker import STACK_SIGNAL, run_worker
 from madns_runtime.lockstep.worker_line import READ_BYTES
 from madns_runtime.reactor.reactor import Reactor
+from madns_runtime.signal_names import signal_name
 from madns_runtime.timing.granted_clock import GrantedClock, GrantedLimit
 
 STACK_WAIT_S = 0.3
@@ -255,4 +256,4 @@ def _await_exit(pid: int) -> int | None:
 
 
 def _how(code: int) -> str:
-    return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended, exit code {code}"
+    return f"was killed by {signal_name(-code)}" if code < 0 else f"ended, exit code {code}"

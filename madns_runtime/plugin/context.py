@@ -227,7 +227,7 @@ def describe_exception(
         called: What was called, where it is known.
     """
     if isinstance(error, BlamedError | ConfigurationError | MissingExtraError):
-        return clean_text(str(error))
+        return clean_text(error_text(error))
     frames = traceback.extract_tb(error.__traceback__)
     place = ""
     if called is not None and not frames[1:]:

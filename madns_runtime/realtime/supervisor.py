@@ -37,6 +37,7 @@ from madns_runtime.realtime.agent_process import AgentProcess, SupervisorCalls
 from madns_runtime.realtime.agent_report import how_ended
 from madns_runtime.realtime.host_end import watch_host_end
 from madns_runtime.realtime.outcome_pipe import OutcomePipe
+from madns_runtime.signal_names import signal_name
 
 RESTART_DELAY_S = 0.2
 KILL_GRACE_S = 3.0
@@ -226,8 +227,8 @@ class Supervisor:
             child.reason = f"its process ended by itself, exit code 0{where}"
         del self._children[child.pid]
         self._devices.agents_ended(child.agents)
-        signal_name = signal.Signals(-code).name if code < 0 else None
-        how = how_ended(code, signal_name, child.reason, where=where)
+        killed_by = signal_name(-code) if code < 0 else None
+        how = how_ended(code, killed_by, child.reason, where=where)
         has_failed = code != 0 or not child.has_ended_well
         will_restart = has_failed and not self._is_ending and self._may_restart(child)
         self._failed = self._failed or (has_failed and not child.is_killed)
@@ -242,7 +243,7 @@ class Supervisor:
                     "agent": agent,
                     "pid": child.pid,
                     "code": code if code >= 0 and not (has_failed and code == 0) else None,
-                    "signal": signal_name,
+                    "signal": killed_by,
                     "how": how,
                     "on_purpose": child.is_killed,
                     "will_restart": will_restart,

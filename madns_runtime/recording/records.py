@@ -73,7 +73,17 @@ class StreamSchema:
         }
 
 
-TICKS = StreamSchema(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameworkSchema(StreamSchema):
+    """A stream of the framework's own, who records it, and when."""
+
+    roles: tuple[Literal["agent", "host", "machine"], ...]
+    """All that record it, but devices."""
+    is_real_time_only: bool
+    """Whether no run in lockstep records it: no time passes there that could be late."""
+
+
+TICKS = FrameworkSchema(
     "ticks",
     (
         Field("tick", "", "int"),
@@ -81,10 +91,12 @@ TICKS = StreamSchema(
         Field("margin_us", "us", "int"),
         Field("missed", "", "int"),
     ),
+    roles=("agent",),
+    is_real_time_only=True,
 )
 """Every tick of an agent: wake-up minus deadline, time left when the step ended, ticks skipped before it."""
 
-LATE_TICKS = StreamSchema(
+LATE_TICKS = FrameworkSchema(
     "late_ticks",
     (
         Field("tick", "", "int"),
@@ -92,6 +104,8 @@ LATE_TICKS = StreamSchema(
         Field("missed", "", "int"),
         Field("cause", "", "str"),
     ),
+    roles=("agent",),
+    is_real_time_only=True,
 )
 """
 Ticks that began too late, or not at all (*missed*, just before this one), and what was measured to be the cause.
@@ -99,7 +113,7 @@ Ticks that began too late, or not at all (*missed*, just before this one), and w
 Those that no other followed stand before the one that would have come next, with a lateness of 0.
 """
 
-CLOCK = StreamSchema(
+CLOCK = FrameworkSchema(
     "clock",
     (
         Field("t_s", "s"),
@@ -108,13 +122,17 @@ CLOCK = StreamSchema(
         Field("uncertainty_us", "us"),
         Field("round_trip_us_min", "us"),
     ),
+    roles=("agent",),
+    is_real_time_only=True,
 )
 """An agent's estimate of the host's clock minus its own; the round trip is the window's least."""
 
-EVENTS = StreamSchema(
+EVENTS = FrameworkSchema(
     "events",
     (Field("t_s", "s"), Field("utc", "", "str"), Field("event", "", "str")),
     shape="object",
+    roles=("agent", "host"),
+    is_real_time_only=False,
 )
 """State changes, losses, deadlines broken, and who was the cause."""
 
@@ -140,7 +158,7 @@ DEVICE_EVENT_WORDS = (
 DEVICE_LOSSES = "device_losses"
 """Of EVENT_WORDS, and key of an agent's account: what found no room between it and its devices."""
 
-LOG = StreamSchema(
+LOG = FrameworkSchema(
     "log",
     (
         Field("t_s", "s"),
@@ -149,13 +167,15 @@ LOG = StreamSchema(
         Field("text", "", "str"),
     ),
     shape="object",
+    roles=("agent", "host"),
+    is_real_time_only=False,
 )
 """Logged sentences, as loud as recording.verbosity lets through."""
 
 LOG_LEVELS = {"critical": 50, "error": 40, "warning": 30, "info": 20, "debug": 10}
 """All that `log` holds in `level`, each with its number in Python's logging."""
 
-HEALTH = StreamSchema(
+HEALTH = FrameworkSchema(
     "health",
     (
         Field("utc", "", "str"),
@@ -198,12 +218,14 @@ HEALTH = StreamSchema(
         Field("process_uptime_s", "s"),
         Field("board_uptime_s", "s"),
     ),
+    roles=("machine",),
+    is_real_time_only=True,
 )
 """State of health of one machine (thesis A.1.4). Counters run from the machine's start; what a machine
 does not offer is null. It keeps the wall clock's time and the machine's own monotonic one, for the
 process that samples it knows no simulated time."""
 
-PROCESS = StreamSchema(
+PROCESS = FrameworkSchema(
     "process",
     (
         Field("t_s", "s"),
@@ -213,6 +235,8 @@ PROCESS = StreamSchema(
         Field("voluntary_switches", "", "int"),
         Field("involuntary_switches", "", "int"),
     ),
+    roles=("agent",),
+    is_real_time_only=True,
 )
 """Use of resources by a process of the run: CPU since its last record, memory, and counters since its start."""
 

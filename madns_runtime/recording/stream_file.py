@@ -64,6 +64,13 @@ def path_of(directory: Path, name: str, number: int) -> Path:
     return directory / (f"{name}.jsonl" if number == 1 else f"{name}.{number}.jsonl")
 
 
+def files_of(directory: Path, name: str) -> tuple[Path, ...]:
+    """Return the files of a stream that a folder holds, in the order in which its process was started anew."""
+    found = (path for path in directory.glob("*.jsonl") if path.name.partition(".")[0] == name)
+    own = (path for path in found if path == path_of(directory, name, number_of(path)))
+    return tuple(sorted(own, key=number_of))
+
+
 def number_of(path: Path) -> int:
     """Return the number in the name of a stream's file."""
     _, dot, number = path.stem.rpartition(".")

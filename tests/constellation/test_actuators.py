@@ -9,11 +9,12 @@ from madns_runtime.simulations.constellation.equipment import ReactionWheels, Th
 from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
     ActuatorRefusal,
     Burn,
-    Tank,
     chance_of,
     fire,
     turn,
 )
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect
+from madns_runtime.simulations.constellation.truth.maneuvers.tank import Tank
 
 EXACT = Thruster(isp_s=220.0, propellant_kg=20.0)
 
@@ -26,11 +27,24 @@ def chance(number=0, agent="a", seed=1):
     return chance_of(seed, agent, number)
 
 
+def book(full, burn):
+    effect = Effect(
+        number=0,
+        kind="impulse",
+        at_s=10.0,
+        start_s=10.0,
+        end_s=10.0,
+        vector=burn.vector,
+        burnt=burn.burnt,
+    )
+    full.book(effect, burn.propellant_kg, now_s=5.0)
+
+
 def test_an_exact_thruster_gives_what_is_commanded_for_what_tsiolkovsky_says():
     full = tank()
 
     burn = fire(EXACT, full, (3.0, 0.0, 4.0), chance())
-    full.book(burn, 10.0, 10.0, now_s=5.0)
+    book(full, burn)
 
     assert burn.vector == (3.0, 0.0, 4.0)
     assert burn.duration_s == 0.0
@@ -46,7 +60,7 @@ def test_the_order_of_burns_changes_nothing_of_what_is_left():
         full = tank()
         for delta_v in order:
             burn = fire(EXACT, full, (delta_v, 0.0, 0.0), chance())
-            full.book(burn, 10.0, 10.0, now_s=5.0)
+            book(full, burn)
         left.append(full.propellant_kg)
 
     assert left == pytest.approx([left[0]] * 3, abs=1e-12)

@@ -1,14 +1,18 @@
 """What `cosmos validate` finds in vehicles, flight software, sensors and the ground, before anything runs."""
 
 import ast
+import dataclasses
 import importlib.util
 import re
 import sys
+from dataclasses import dataclass
+from typing import ClassVar
 
 import pytest
 from constellation_fakes import SCENARIOS, WALKER, parameters
 
 from madns_runtime.simulations.constellation.check import find_faults
+from madns_runtime.simulations.constellation.parameters import PropagatorProperties
 
 AGENTS = ("agent-01", "agent-02")
 GUIDANCE = """
@@ -306,6 +310,27 @@ def test_a_ballistic_coefficient_that_no_drag_heeds_is_remarked(folder, propagat
 
     assert len(found) == (told is not None)
     assert all(told in text for text in found)
+
+
+@dataclass(frozen=True)
+class Own:
+    """Settings of a propagator that is none of the shipped ones."""
+
+    PROPERTIES: ClassVar = PropagatorProperties(engine="own:Own", knows_drag=True)
+    can_maneuver: ClassVar = True
+    kind: str = "own"
+    forces: tuple = ("two_body",)
+
+
+@pytest.mark.parametrize("forces", [("two_body",), ("two_body", "drag")])
+def test_what_a_propagator_knows_is_asked_of_its_properties(folder, forces):
+    given = parameters(vehicles=[{"ballistic_m2_kg": 0.5}])
+    given = dataclasses.replace(given, propagator=Own(forces=forces))
+
+    found = [fault for fault in find_faults(given, 2, folder) if fault.startswith("remark: ")]
+
+    told = "changes nothing: drag is not among parameters.propagator.forces"
+    assert [fault.endswith(told) for fault in found] == [True] * ("drag" not in forces)
 
 
 @pytest.mark.parametrize(

@@ -186,6 +186,78 @@ def test_an_epoch_without_microseconds_is_read_and_one_with_a_zone_is_not(tmp_pa
     assert "EPOCH" in faults_of(path, CSV.replace("54.808992", "54.808992+02:00"))[0]
 
 
+NAMESPACE = "urn:ccsds:schema:ndmxml"
+PREFIXED = re.sub(r"<(/?)(?=\w)", r"<\1n:", XML).replace("<n:ndm", f'<n:ndm xmlns:n="{NAMESPACE}"')
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.csv", CSV.replace("2017-03-07T", "2017-066T")),
+        ("a.json", JSON.replace("2017-03-07T", "2017-066T")),
+        ("a.csv", CSV.replace("2017-03-07T", "2017-03-07 ")),
+        ("a.xml", XML.replace("<ndm", f'<ndm xmlns="{NAMESPACE}"', 1)),
+        ("a.xml", PREFIXED),
+        ("a.csv", "\n \n" + CSV),
+        ("a.txt", "\n" + CSV),
+        ("a.csv", CSV.replace(",", ", ")),
+        ("a.tle", TLE.replace("IRIDIUM", "#1 IRI")),
+    ],
+    ids=[
+        *("day of year csv", "day of year json", "blank for T", "default namespace", "prefix"),
+        *("empty lines", "empty line txt", "blanks", "name with a number sign"),
+    ],
+)
+def test_other_legal_forms_of_the_same_sets_are_read(tmp_path, name, text):
+    assert text != {"csv": CSV, "json": JSON, "xml": XML, "tle": TLE}.get(name[2:])
+    path = tmp_path / name
+    path.write_text(text)
+    plain = read_element_sets(DATA / f"iridium10.{name[2:].replace('txt', 'csv')}")
+
+    found = read_element_sets(path)
+
+    expected = [
+        s.name.replace("IRIDIUM", "#1 IRI" if name == "a.tle" else "IRIDIUM") for s in plain
+    ]
+    assert [s.name for s in found] == expected
+    assert [(s.lines, s.omm, s.epoch_utc) for s in found] == [
+        (s.lines, s.omm, s.epoch_utc) for s in plain
+    ]
+    assert len({s.place for s in found}) == len(plain)
+
+
+@pytest.mark.parametrize("date", ["2017-W10-2", "2017-000", "2017-366", "20170307", "0001-000"])
+def test_dates_that_ccsds_does_not_have_are_refused(tmp_path, date):
+    found = faults_of(tmp_path / "a.csv", CSV.replace("2017-03-07", date, 1))
+
+    assert found[0].startswith("2: EPOCH: expected such as 2017-03-07T07:18:55.000000 or 2017-066T")
+
+
+def test_faults_below_empty_lines_have_their_own_line(tmp_path):
+    lines = ("\n\n" + CSV.replace("86.4011", "polar", 1)).splitlines()
+
+    assert faults_of(tmp_path / "a.csv", "\n".join(lines))[0].startswith("5: INCLINATION")
+    lines[2] = lines[2].replace("BSTAR", "B*")
+    assert faults_of(tmp_path / "a.csv", "\n".join(lines))[0].startswith("3: expected the columns")
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a.kvn", "a.tle", "a.csv"])
+def test_kvn_is_called_kvn(tmp_path, name):
+    [fault] = faults_of(
+        tmp_path / name, "CCSDS_OMM_VERS = 2.0\nOBJECT_NAME = ISS\nORIGINATOR = X\n"
+    )
+
+    assert "OMM as KVN" in fault
+
+
+@pytest.mark.parametrize("comment", ["# 1 is old", "#", "#old", "#" + "1" * 24, "#1 SAT\n# one"])
+def test_comments_above_a_set_without_a_name_are_no_names(tmp_path, comment):
+    path = tmp_path / "a.tle"
+    path.write_text("\n".join((comment, *TLE.splitlines()[1:3])))
+
+    assert [s.name for s in read_element_sets(path)] == ["24792"]
+
+
 def test_six_digit_catalogue_numbers_are_flown(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(CSV.replace("24792", "799500100"))
@@ -289,6 +361,51 @@ def test_a_set_that_falls_is_followed_down_to_the_earth_and_stands_still_there()
     assert np.abs(radii_m[0] - 7.15e6).max() < 3e4
     with pytest.raises(ConfigurationError, match=f"^{falling.name}: SGP4: .*, at .* s$"):
         sgp4_states((high, falling), low.epoch_utc, knots_s)
+
+
+# 180 km up, with the drag of a balloon: down after three hours. After four SGP4 has no states of it, later some again.
+BALLOON = """FALL
+1 25544U 98067A   20045.18587073  .00000950  00000-0  10000-0 0  9995
+2 25544  51.6443 242.2052 0010000 264.6060 207.3845 16.10000000212795
+"""
+DOWN_S, WITHOUT_S = 10_640.0, 14_400.0
+
+
+@pytest.fixture
+def beside_a_balloon(tmp_path):
+    (tmp_path / "a.tle").write_text(BALLOON)
+    (balloon,) = read_element_sets(tmp_path / "a.tle")
+    high = replace(read_element_sets(DATA / "iridium10.csv")[0], epoch_utc=balloon.epoch_utc)
+    parameters = PropagationParameters(
+        settings=Sgp4Propagator(kind="sgp4"),
+        gravity=EGM_96,
+        epoch_utc=balloon.epoch_utc,
+        element_sets=(high, balloon),
+    )
+    return np.full((2, 6), 7e6), parameters
+
+
+@pytest.mark.parametrize("window_s", [300.0, 21_600.0])
+def test_a_set_that_sgp4_does_not_know_after_its_fall_ends_nobody_else(beside_a_balloon, window_s):
+    states, parameters = beside_a_balloon
+    alone = parameters.of([0])
+    for from_s in np.arange(0.0, 21_600.0, window_s):
+        knots_s = np.arange(from_s, from_s + window_s + 1.0, 10.0)
+
+        found = propagate(states, from_s, knots_s, parameters)
+
+        assert np.array_equal(found[:1], propagate(states[:1], from_s, knots_s, alone))
+        down_m = np.linalg.norm(found[1, knots_s > DOWN_S + 20.0, :3], axis=-1)
+        assert np.abs(down_m - EARTH_POLAR_RADIUS_M).max(initial=0.0) < 1e3
+        states = found[:, -1]
+    assert not states[1, 3:].any()
+
+
+def test_a_set_without_states_that_has_not_fallen_ends_the_run(beside_a_balloon):
+    _, parameters = beside_a_balloon
+
+    with pytest.raises(ConfigurationError, match="^FALL: SGP4: mean eccentricity .* at 14"):
+        propagate(np.full((2, 6), 7e6), WITHOUT_S, WITHOUT_S + np.arange(9.0), parameters)
 
 
 def test_julian_dates_are_those_of_the_almanac():

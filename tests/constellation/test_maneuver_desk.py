@@ -112,6 +112,12 @@ def test_late_commands_are_refused_where_the_scenario_says_so():
     ("wrong", "reason"),
     [
         ({"at_s": 100.1}, "beyond the run"),
+        ({"at_s": 100.0}, "100 s is the end of the run's 100 s"),
+        ({"at_s": 100.0 - 1e-8}, "100 s is the end of the run's 100 s"),
+        (
+            {"at_s": 100.0, "kind": "ballistic", "vector": (0.02, 0.0, 0.0)},
+            "100 s is the end of the run's 100 s",
+        ),
         ({"at_s": math.nan}, "finite"),
         ({"vector": (math.inf, 0.0, 0.0)}, "finite"),
         ({"vector": (0.0, 0.0, 0.0)}, "0 m/s"),
@@ -140,6 +146,21 @@ def test_what_cannot_be_done_is_refused_and_says_why(wrong, reason):
     assert reason in taken.reason
     assert at._timelines[0].effects == ()
     assert (at.account.commanded, at.account.refused) == (1, 1)
+
+
+def test_what_is_postponed_to_the_end_of_the_run_is_refused():
+    taken = desk().decide(0, command(99.9), 99.9)
+
+    assert (taken.status, taken.at_s) == ("refused", 100.0)
+
+
+@pytest.mark.parametrize(("at_s", "status"), [(100.0, "accepted"), (100.1, "refused")])
+def test_a_burn_around_the_end_of_the_run_is_flown_until_then(at_s, status):
+    slow = Vehicle(thruster=replace(THRUSTER, thrust_n=20.0))
+
+    taken = desk(slow).decide(0, command(at_s), 10.0)
+
+    assert taken.status == status
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,12 @@
 """What every propagator keeps, whoever computes."""
 
+import dataclasses
 import math
 import pickle  # noqa: TID251 - as executors do with arguments
 import subprocess
 import sys
 from dataclasses import replace
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -13,12 +15,9 @@ from propagator_kinds import EXTRAS, OWN, distance_m, make_kind, orbits
 from madns_runtime.errors import ConfigurationError, MissingExtraError
 from madns_runtime.simulations.constellation.orbit.constants import EARTH_POLAR_RADIUS_M
 from madns_runtime.simulations.constellation.orbit.invariants import ENERGY
-from madns_runtime.simulations.constellation.parameters import (
-    CustomPropagator,
-)
+from madns_runtime.simulations.constellation.parameters import PROPAGATORS, CustomPropagator
 from madns_runtime.simulations.constellation.truth import propagators
 from madns_runtime.simulations.constellation.truth.propagation import (
-    PROPAGATORS,
     conserved_by,
     load_propagator,
     propagate,
@@ -364,6 +363,14 @@ def test_properties_are_those_of_the_engine(kind):
     assert np.array_equal(by_itself[0], together[1]) == properties.is_independent
     elsewhere = propagate(states + 1.0, 0.0, knots_s, given)
     assert np.array_equal(elsewhere, together) == properties.needs_element_sets
+
+
+@pytest.mark.parametrize("settings", PROPAGATORS.values(), ids=PROPAGATORS)
+def test_drag_is_known_to_those_of_whom_it_may_be_asked(settings):
+    fields = {field.name: field.type for field in dataclasses.fields(settings)}
+    may_be_asked = "forces" in fields and "drag" in str(get_type_hints(settings)["forces"])
+
+    assert settings.PROPERTIES.knows_drag == may_be_asked
 
 
 @pytest.mark.parametrize(("name", "extra"), [("numba", "fast"), ("basilisk", "basilisk")])

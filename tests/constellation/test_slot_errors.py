@@ -5,13 +5,14 @@ import re
 
 import numpy as np
 import pytest
-from constellation_fakes import FakeContext, parameters
+from constellation_fakes import SCENARIOS, FakeContext, parameters
 
 from madns_runtime.simulations.constellation.analysis.slots import even_errors_deg
 from madns_runtime.simulations.constellation.check import find_faults
 from madns_runtime.simulations.constellation.host_side.slot_errors import SlotErrors
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
 from madns_runtime.simulations.constellation.orbit.mean_elements import mean_from_state
+from madns_runtime.simulations.constellation.truth.tle_files import tle_checksum
 
 KEEPER = {"software": "slots.py:Keeper", "settings": {"slots": "even"}}
 RADIUS_M = 7.158e6
@@ -147,3 +148,63 @@ def test_record_of_slots_that_nobody_has_is_refused(tmp_path, flight, expected):
         each for each in found if expected in each
     ]
     assert any(expected in each for each in found)
+
+
+def ring_of(*inclinations_deg, raan_deg=0.0):
+    orbits = [
+        {"name": f"S{number}", "altitude_km": 780.0, "i_deg": i_deg, "raan_deg": raan_deg * number}
+        for number, i_deg in enumerate(inclinations_deg)
+    ]
+    return {"keplerian": orbits}
+
+
+EQUATORIAL = (
+    "expected inclinations of 0.1 to 179.9 deg with flight software whose settings say slots"
+)
+
+
+@pytest.mark.parametrize("slots", ["even", "kept"])
+@pytest.mark.parametrize(
+    ("satellites", "told"),
+    [
+        ({"walker": "0:4/1/0", "altitude_km": 35_786.0}, "got 0 of P1S1 and 3 more: "),
+        (ring_of(0.02, 0.02, 0.02, 0.02, raan_deg=70.0), "got 0.02 of S0 and 3 more: "),
+        (ring_of(50.0, 179.95, 50.0, 50.0), "got 179.95 of S1: "),
+    ],
+    ids=["no nodes", "nodes anywhere", "retrograde"],
+)
+def test_slots_in_the_equator_are_refused(tmp_path, satellites, slots, told):
+    flight = {"software": "slots.py:Keeper", "settings": {"slots": slots}}
+    names = tuple(f"agent-{number}" for number in range(1, 5))
+
+    found = find_faults(parameters(satellites, flight=flight), 4, tmp_path, names=names)
+
+    [fault] = [each for each in found if EQUATORIAL in each]
+    assert fault.startswith("parameters.satellites: ")
+    assert told in fault
+
+
+def test_the_equator_is_refused_to_those_with_slots_alone(tmp_path):
+    keeper = {**KEEPER, "agents": ["agent-1", "agent-2"]}
+    others = {"software": "f.py:F", "agents": ["agent-3"]}
+    asked = parameters(ring_of(0.1, 179.9, 0.0, 0.0), flight=[keeper, others])
+    names = tuple(f"agent-{number}" for number in range(1, 5))
+
+    assert EQUATORIAL not in "".join(find_faults(asked, 4, tmp_path, names=names))
+
+
+@pytest.mark.parametrize("suffix", ["tle", "csv"])
+def test_inclinations_of_element_sets_count(tmp_path, suffix):
+    text = (SCENARIOS / "data" / f"iridium10.{suffix}").read_text()
+    lines = text.splitlines()
+    if suffix == "tle":
+        line = lines[2].replace(lines[2][8:16], "  0.0500")[:68]
+        lines[2] = line + str(tle_checksum(line))
+    else:
+        lines[1] = lines[1].replace("86.4004", "0.05")
+    (tmp_path / f"sets.{suffix}").write_text("\n".join(lines))
+    asked = parameters({"elements": f"sets.{suffix}"}, flight=KEEPER, propagator={"kind": "sgp4"})
+
+    found = find_faults(asked, 2, tmp_path, names=("agent-1", "agent-2"))
+
+    assert [each for each in found if EQUATORIAL in each and "got 0.05 of IRIDIUM 8: " in each]

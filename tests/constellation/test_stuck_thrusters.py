@@ -11,20 +11,21 @@ from madns_runtime.plugin.api import ActionRefused, TimelineAction
 from madns_runtime.simulations.constellation.actions import STICK_THRUSTER_OPEN, StuckThruster
 from madns_runtime.simulations.constellation.equipment import Thruster, Vehicle
 from madns_runtime.simulations.constellation.messages import Command
-from madns_runtime.simulations.constellation.truth.maneuvers.actuators import Tank, exhaust_m_s
+from madns_runtime.simulations.constellation.truth.maneuvers.actuators import exhaust_m_s
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect, Timeline
 from madns_runtime.simulations.constellation.truth.maneuvers.stuck_thrusters import (
     ARC_S,
     StuckDirection,
     StuckThrusters,
 )
+from madns_runtime.simulations.constellation.truth.maneuvers.tank import Tank
 
 GUARD = '''
 class Guard:
     """Closes its thruster off some seconds after the accelerometer has felt a thrust that nobody commanded."""
 
     def setup(self, context):
-        self.context, self.felt_s, self.masses, self.told = context, None, [], []
+        self.context, self.felt_s, self.masses, self.told, self.given_m_s = context, None, [], [], 0.0
 
     def step(self, t_s, readings):
         if "mass" in readings:
@@ -39,12 +40,15 @@ class Guard:
             self.context.torque((0.0, 0.0, 1e-4), at_s=t_s + 2.0, duration_s=1.0)
         if self.context.settings.get("burn_s") == t_s:
             self.context.delta_v((0.0, 0.01, 0.0), at_s=t_s + 1.0)
+        if t_s == 1.0 and "later_m_s" in self.context.settings:
+            self.context.delta_v((0.0, self.context.settings["later_m_s"], 0.0), at_s=45.0)
 
     def command_result(self, result):
         self.told.append(f"{result.status} {result.at_s:.2f} {result.propellant_kg:.4f} {result.reason}")
+        self.given_m_s = result.delta_v_m_s
 
     def finish(self):
-        return {"felt_s": self.felt_s, "masses": self.masses, "told": self.told}
+        return {"felt_s": self.felt_s, "masses": self.masses, "told": self.told, "given_m_s": self.given_m_s}
 '''
 THRUSTER = {"isp_s": 220.0, "propellant_kg": 2.0, "thrust_n": 1.0}
 EXHAUST_M_S = 220.0 * 9.80665
@@ -213,6 +217,46 @@ def test_a_thruster_without_thrust_needs_one_and_a_point_has_no_body_axes(fly):
         star.host.begin_action(action(thrust_n=0.1))
 
 
+@pytest.mark.parametrize("thrust_n", [None, 20.0])
+def test_a_burn_that_waits_changes_nothing_of_it_and_is_weighed_after_it(fly, thrust_n):
+    thruster = {"isp_s": 220.0, "propellant_kg": 50.0, "thrust_n": thrust_n}
+    alone, before = fly(thruster=thruster), fly(thruster=thruster, later_m_s=5.0)
+
+    (free,) = stick(alone, ends_s=30.0, thrust_n=1.0)
+    (told,) = stick(before, ends_s=30.0, thrust_n=1.0)
+
+    assert told == free
+    flight = before.summaries()["agent-02"]["flight"]
+    stuck_kg = 20.0 / EXHAUST_M_S
+    mass_kg = (100.0 - stuck_kg) * math.exp(-5.0 / EXHAUST_M_S)
+    assert flight["told"][-1].split()[0] == "executed"
+    assert flight["given_m_s"] == 5.0
+    assert flight["masses"][-1] == pytest.approx(mass_kg - 50.0, abs=1e-9)
+    early = [state_rows(star, "agent-02") for star in (alone, before)]
+    assert np.array_equal(*(rows[rows[:, 0] < 30.0] for rows in early))
+
+
+@pytest.mark.parametrize(
+    ("thrust_n", "later_m_s", "stuck_n", "ended"),
+    [(None, 43.5, 1.0, "mended"), (200.0, 43.5, 1.0, "mended"), (None, 0.1, 300.0, "empty")],
+)
+def test_it_burns_what_was_meant_for_a_burn_that_waits(fly, thrust_n, later_m_s, stuck_n, ended):
+    thruster = {"isp_s": 220.0, "propellant_kg": 2.0, "thrust_n": thrust_n}
+    star = fly(thruster=thruster, later_m_s=later_m_s)
+
+    (told,) = stick(star, ends_s=30.0, thrust_n=stuck_n)
+
+    flight = star.summaries()["agent-02"]["flight"]
+    all_m_s = EXHAUST_M_S * math.log(100.0 / 98.0)
+    assert told["ended"] == ended
+    assert (told["propellant_left_kg"] > 0.0) == (ended == "mended")
+    assert "executed" in flight["told"][-1]
+    assert flight["told"][-1].endswith(
+        "0.0000 the tank ran empty: the thruster was stuck open before"
+    )
+    assert told["delta_v_m_s"] + flight["given_m_s"] == pytest.approx(all_m_s, abs=1e-9)
+
+
 def test_arcs_leave_room_for_a_burn_that_was_commanded_before():
     vehicle = Vehicle(thruster=Thruster(isp_s=220.0, propellant_kg=2.0, thrust_n=1.0))
     timeline, tank = Timeline(0.0), Tank(vehicle)
@@ -234,3 +278,76 @@ def test_arcs_leave_room_for_a_burn_that_was_commanded_before():
     assert tank.propellant_kg == pytest.approx(2.0 - burnt_kg)
     assert stuck.close(0, 24.0, "closed") == 24.0
     assert tank.propellant_kg == pytest.approx(2.0 - burnt_kg + 4.0 / exhaust_m_s(vehicle.thruster))
+
+
+def waiting_burn(*, is_arc, burnt=0.01):
+    vehicle = Vehicle(
+        mass_kg=100.0, thruster=Thruster(isp_s=220.0, propellant_kg=1.0, thrust_n=20.0)
+    )
+    timeline, tank = Timeline(0.0), Tank(vehicle)
+    half_s = 4.0 if is_arc else 0.0
+    gain_m_s = -exhaust_m_s(vehicle.thruster) * math.log1p(-burnt)
+    effect = Effect(
+        number=0,
+        kind="thrust" if is_arc else "impulse",
+        at_s=22.0,
+        start_s=22.0 - half_s,
+        end_s=22.0 + half_s,
+        vector=(0.0, gain_m_s, 0.0),
+        burnt=burnt,
+    )
+    timeline.add(effect)
+    tank.book(effect, 100.0 * burnt, now_s=0.0)
+    stuck = StuckThrusters([vehicle], [timeline], [tank], knot_s=1.0, duration_s=100.0)
+    push = StuckDirection(thrust_n=10.0, direction=(0.0, 1.0, 0.0), frame="rtn")
+    return effect, timeline, tank, stuck, stuck.open(0, push, 10.0)
+
+
+def test_no_arc_goes_on_over_an_impulse_that_makes_the_vehicle_lighter():
+    _, timeline, tank, stuck, opened = waiting_burn(is_arc=False, burnt=0.001)
+
+    for t_s in range(10, 23):
+        stuck.extend(opened, float(t_s))
+
+    edges = [(each.start_s, each.end_s) for each in timeline.effects]
+    assert edges == [(10.0, 15.0), (15.0, 20.0), (20.0, 22.0), (22.0, 22.0), (22.0, 27.0)]
+    masses_kg = [mass_kg for _, mass_kg in opened.arcs]
+    before_kg = 100.0 - 12.0 * opened.flow_kg_s
+    assert masses_kg[-1] == pytest.approx(before_kg * 0.999, abs=1e-12)
+    left_kg = before_kg * 0.999 - 99.0 - 5.0 * opened.flow_kg_s
+    assert tank.left_kg(27.0) == pytest.approx(left_kg, abs=1e-12)
+
+
+@pytest.mark.parametrize("is_arc", [False, True])
+def test_a_thruster_that_is_closed_in_time_leaves_a_burn_what_was_given_ahead(is_arc):
+    effect, timeline, tank, stuck, opened = waiting_burn(is_arc=is_arc)
+    for t_s in (10.0, 13.0):
+        stuck.extend(opened, t_s)
+    (drained,) = [each for each in timeline.effects if each.number == 0]
+    ahead_kg = opened.flow_kg_s * (8.0 if is_arc else 10.0)
+    assert drained.burnt == pytest.approx((1.0 - ahead_kg) / (100.0 - ahead_kg), abs=1e-15)
+
+    stuck.close(0, 10.0, "closed")
+
+    assert timeline.effects == (effect,)
+    assert stuck.drained == {}
+    assert (tank.propellant_kg, tank.left_kg(10.0)) == pytest.approx((0.0, 1.0), abs=1e-12)
+
+
+@pytest.mark.parametrize(("burnt", "end_s"), [(0.005, 14.0), (1e-5, 10.0), (0.0, 10.0)])
+def test_a_drained_arc_ends_sooner_and_one_that_is_hardly_there_is_an_impulse(burnt, end_s):
+    whole = Effect(
+        number=0,
+        kind="thrust",
+        at_s=14.0,
+        start_s=10.0,
+        end_s=18.0,
+        vector=(0.0, math.log1p(-0.01), 0.0),
+        burnt=0.01,
+    )
+
+    drained = whole.drained(burnt)
+
+    assert (drained.kind, drained.start_s) == ("thrust" if end_s > 10.0 else "impulse", 10.0)
+    assert drained.end_s == pytest.approx(end_s)
+    assert drained.vector == pytest.approx((0.0, math.log1p(-burnt), 0.0), abs=1e-15)

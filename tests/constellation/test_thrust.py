@@ -19,11 +19,11 @@ from madns_runtime.simulations.constellation.thrust import Thrust, velocity_gain
 from madns_runtime.simulations.constellation.truth import vehicle_propagation
 from madns_runtime.simulations.constellation.truth.initial_states import load_fleet
 from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
-    Tank,
     chance_of,
     fire,
 )
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import Effect, Timeline
+from madns_runtime.simulations.constellation.truth.maneuvers.tank import Tank
 from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
 from madns_runtime.simulations.constellation.truth.propagators.forces import acceleration_of
 from madns_runtime.simulations.constellation.truth.propagators.rigid_body import (

@@ -10,9 +10,8 @@ import pytest
 from guides import ROOT, blocks
 
 from madns_runtime.simulations.constellation.orbit.constants import EGM_96
-from madns_runtime.simulations.constellation.parameters import CustomPropagator
+from madns_runtime.simulations.constellation.parameters import PROPAGATORS, CustomPropagator
 from madns_runtime.simulations.constellation.truth.propagation import (
-    PROPAGATORS,
     PropagationParameters,
     propagate,
 )

@@ -3,6 +3,7 @@
 import re
 import shlex
 import sys
+from typing import get_args
 
 import jsonschema
 import pytest
@@ -10,7 +11,7 @@ import yaml
 from guides import ROOT, blocks, run
 
 from cosmos_cli.commands.command_group import each_command
-from cosmos_cli.models.baseline import read_baseline
+from cosmos_cli.models.baseline import Statistic, read_baseline
 from cosmos_cli.models.scenario_outline import read_outline
 
 GUIDE = (ROOT / "docs/ci.md").read_text("utf-8")
@@ -187,6 +188,12 @@ def test_the_guides_section_and_baseline_are_right(tmp_path):
     outline = read_outline(tmp_path / "s.yaml")
     assert outline.load(outline.overrides(), print).scenario.agents.count == 5
     assert outline.baseline().figures == read_baseline(tmp_path / "baselines/ring.yaml").figures
+
+
+def test_the_guide_names_every_statistic_and_no_other():
+    sentence = GUIDE.split("`statistic` is", 1)[1].split("over all records", 1)[0]
+
+    assert re.findall(r"`(\w+)`", sentence) == list(get_args(Statistic))
 
 
 def test_the_guide_shows_the_jobs_heart():

@@ -20,6 +20,7 @@ from cosmos_cli.models.limit import select_machines
 from cosmos_cli.models.loading import load_scenario
 from cosmos_cli.models.machine_facts import SystemPaths
 from cosmos_cli.models.provision_steps import KINDS
+from cosmos_cli.provision.step import Kind
 from cosmos_cli.provision.steps import PLANNERS
 
 INVENTORY, PROVISION, PLACEMENT = blocks(FLEET, "yaml")
@@ -71,6 +72,10 @@ def test_table_of_variables_says_what_is_declared():
 
 def test_every_variable_of_ansible_that_counts_is_documented_and_no_other():
     assert set(row_keys(FLEET, "### Ansible's variables")) == names_of("ansible_")
+
+
+def test_every_kind_of_what_up_changes_is_documented_and_no_other():
+    assert row_keys(FLEET, "## What up does") == [kind.value for kind in Kind]
 
 
 def test_every_kind_of_failure_is_documented_and_no_other():
@@ -187,7 +192,14 @@ def test_example_of_placement_does_what_it_says(tmp_path):
     assert sum(map(len, plan.agents_by_machine.values())) == 12
 
 
-@pytest.mark.parametrize("guide", [*GUIDES, ROOT / "CHANGELOG.md"], ids=lambda path: path.name)
+BESIDE = [path for folder in ("tests", "scenarios") for path in (ROOT / folder).rglob("*.md")]
+
+
+@pytest.mark.parametrize(
+    "guide",
+    [*GUIDES, ROOT / "CHANGELOG.md", *sorted(BESIDE)],
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
 def test_every_link_of_a_guide_leads_somewhere(guide):
     linked = re.findall(r"\]\(([^)\s]+)\)", guide.read_text("utf-8"))
 

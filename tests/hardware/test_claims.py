@@ -20,6 +20,7 @@ from madns_runtime.hardware import claims
 from madns_runtime.hardware.claims import DeviceClaims, claim_path
 from madns_runtime.hardware.contract import Channel, DeviceKind
 from madns_runtime.hardware.kind_registry import prepare
+from tests.hardware.bench import line_bench
 
 DEVICE = DeviceLaunch(
     name="imu",
@@ -124,6 +125,36 @@ def test_where_claims_cannot_be_kept_it_is_told(monkeypatch: pytest.MonkeyPatch)
     own.claim(DEVICE, KIND)
 
     assert own.problem.startswith("other runs are not kept from its devices: ")
+
+
+def is_free(device: DeviceLaunch) -> bool:
+    """Tell whether another run would get the device."""
+    other = DeviceClaims("b")
+    try:
+        other.claim(device, KIND)
+    except MachineError:
+        return False
+    other.release()
+    return True
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("is_guarded", [False, True])
+def test_a_claim_outlives_its_supervisor_in_what_may_open_the_device(
+    tmp_path: Path, is_guarded: bool
+) -> None:
+    with line_bench(tmp_path, launch={"may_move": is_guarded}) as (bench, _):
+        (device,) = bench.manager._launch.devices
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+
+        bench.manager._claims.release()  # as the supervisor's end does
+        assert not is_free(device)
+        os.kill(bench.pid_of(), signal.SIGKILL)
+        os.waitid(os.P_PID, bench.pid_of(), os.WEXITED | os.WNOWAIT)
+        assert is_free(device) is not is_guarded  # the guardian is about to open it
+
+        bench.close()
+        wait_until(lambda: is_free(device))
 
 
 DRIVER = """

@@ -210,6 +210,46 @@ def test_a_driver_that_raises_is_told_by_name_and_tried_again(tmp_path, method):
     assert result["restarts"] == 0  # its process lives
 
 
+@pytest.mark.usefixtures("unhurried")
+def test_what_close_raises_is_counted_and_told_but_not_over_the_fault_before_it(
+    tmp_path, monkeypatch
+):
+    closing = 'raise OSError("it is not open")'
+    assert 'self._raise("close")' in bench_module.DRIVER
+    monkeypatch.setattr(
+        bench_module, "DRIVER", bench_module.DRIVER.replace('self._raise("close")', closing)
+    )
+    told = []
+    for raises in ("", "read"):
+        (tmp_path / raises).mkdir(exist_ok=True)
+        with line_bench(tmp_path / raises, raises=raises) as (bench, _):
+            bench.until(lambda bench=bench: "ok" in bench.statuses("line") or errors(bench) >= 2)
+            told.append(bench.close()["pi22/line"])
+
+    assert told[0]["errors"] == 1
+    assert told[0]["why"].startswith("Line.close raised OSError: it is not open (line.py:")
+    assert told[1]["why"].startswith("Line.read raised ValueError: read does not work (line.py:")
+
+
+@pytest.mark.usefixtures("unhurried")
+@pytest.mark.parametrize(
+    ("ending", "why"),
+    [
+        ("os.kill(os.getpid(), signal.SIGKILL)", "killed by SIGKILL"),
+        ("os._exit(0)", "exit code 0"),
+    ],
+)
+def test_a_process_that_its_driver_ends_at_the_close_is_told_so(tmp_path, monkeypatch, ending, why):
+    monkeypatch.setattr(
+        bench_module, "DRIVER", bench_module.DRIVER.replace('self._raise("close")', ending)
+    )
+    with line_bench(tmp_path) as (bench, _):
+        bench.until(lambda: bench.hardware["line"].status == "ok")
+        result = bench.close()["pi22/line"]
+
+    assert (result["why"], result["report"]["unreported"]) == (why, 1)
+
+
 def test_a_driver_that_fails_while_it_is_made_is_lost_as_one_that_does_not_open(tmp_path):
     made = "\n    def __init__(self, parameters):\n        raise OSError('no such bus')\n"
     (tmp_path / "made.py").write_text(bench_module.DRIVER + "\n\nclass Made(Line):" + made)

@@ -99,6 +99,22 @@ def test_a_recording_at_rest_gives_lines_that_a_scenario_takes(
     assert sensors.gyro is not None and sensors.gyro.device == "imu.rate"  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize("words", [(), ("--channel", "rate")])
+def test_samples_of_all_processes_that_the_device_had_are_used(
+    told: Told, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    folder = recording(tmp_path / "rest", noise(200, 0.02), channel="rate", unit="deg/s")
+    head, *lines = (folder / "rate.jsonl").read_text().splitlines(keepends=True)
+    (folder / "rate.jsonl").write_text("".join([head, *lines[:80]]))
+    (folder / "rate.2.jsonl").write_text("".join([head, *lines[80:]]))
+    (folder / "rate.3.jsonl").touch()  # of a process that was killed before it wrote
+
+    code, found = told("imu", "gyro", "--from", folder, *words)
+
+    assert code == 0, found
+    assert (found["sensors"][0]["channel"], found["sensors"][0]["samples"]) == ("rate", 200)
+
+
 def test_six_recordings_calibrate_an_accelerometer(told: Told, tmp_path: Path) -> None:
     options: list[object] = []
     for number, up in enumerate([*np.eye(3), *-np.eye(3)]):

@@ -195,6 +195,23 @@ def test_a_device_without_samples_leaves_no_recording(
     assert os.listdir(folder.parent) == []
 
 
+@pytest.mark.parametrize("words", [("test", "gauge"), ("record", "gauge", "recorded")])
+def test_a_driver_that_never_returns_from_close_ends_a_trial_with_1_and_is_told(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    hanging = f"{GAUGE}    def close(self):\n        time.sleep(1000)\n"
+    (tmp_path / "gauge.py").write_text(hanging, encoding="utf-8")
+    path = inventory(tmp_path, f"{{name: gauge, kind: './gauge.py:Gauge', rate_hz: {RATE_HZ}}}")
+
+    assert cosmos(["devices", *words, "-i", str(path), "--seconds", str(SECONDS)]) == 1
+    told = capsys.readouterr().err
+    assert "pi22/gauge: its driver did not return within 3 s of the run's end" in told
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

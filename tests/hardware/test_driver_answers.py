@@ -17,7 +17,12 @@ DRIVER = """
 import os
 import time
 
+from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Sample
+
+
+def mute(kind):
+    return type("Mute", (kind,), {"__str__": lambda self: 1 / 0})
 
 
 class Probe(Device):
@@ -94,6 +99,9 @@ def settled(folder):
          "Probe.read: device_s: expected a time of the device's own clock, s, or None; got '1'"),
         ({"read": "return Sample(values=[1.0], taken_s=1.0)"},
          "Probe.read: expected values by channel in a Sample, got [1.0]"),
+        ({"read": "raise KeyboardInterrupt"}, "Probe.read raised KeyboardInterrupt (probe.py:"),
+        ({"read": "raise mute(MachineError)"}, "(its __str__ raised ZeroDivisionError)"),
+        ({"read": "raise mute(PluginError)"}, "Probe.read: (its __str__ raised ZeroDivisionError)"),
         ({"read": "return Sample(values={'level': float('nan')}, taken_s=time.monotonic())", "lost_s": LOST_S},
          "no sample for 3 s, where rate_hz (50) promises one every 0.02 s; so far level_not_finite "),
     ],

@@ -18,6 +18,7 @@ from harness.cosmos_command import LOOSE, CosmosCommand
 from harness.waiting import wait_until
 from pyubx2 import NMEA_PROTOCOL, UBX_PROTOCOL, UBXReader
 
+from madns_runtime.config import DURATION_S_MAX
 from madns_runtime.errors import MachineError, PluginError
 from madns_runtime.hardware.gnss_messages import GnssMessage, ToldQuality, encode
 from madns_runtime.hardware.gnss_solution import GnssSolution, geodetic
@@ -29,6 +30,7 @@ from madns_runtime.simulations.constellation.orbit.earth import (
     geodetic_to_fixed,
     gmst_rad,
 )
+from madns_runtime.simulations.constellation.truth.element_set import LAST_YEAR
 from tests.hardware.bench import Terminal
 from tests.hardware.driving import opened
 
@@ -71,6 +73,47 @@ def test_gps_time_is_ahead_of_utc_by_the_leap_seconds():
     last = solution("2016-12-31T23:59:41.999Z")
     assert (last.week, last.time_of_week_ms) == (1929, 604_799_999)
     assert GnssSolution.of((unix_s("2017-01-01T00:00:00Z"), *LEO, *SPEED), 0).time_of_week_ms == 0
+
+
+@pytest.mark.parametrize(
+    ("utc", "leap_s"),
+    [
+        ("1980-01-06T00:00:00Z", 0),
+        ("1999-01-01T00:00:00Z", 13),
+        ("2000-01-01T12:00:00Z", 13),
+        ("2005-12-31T23:59:59.999Z", 13),
+        ("2006-01-01T00:00:00Z", 14),
+        ("2012-01-01T00:00:00Z", 15),
+        ("2015-07-01T00:00:00Z", 17),
+        ("2016-12-31T23:59:59.9994Z", 17),
+        ("2016-12-31T23:59:59.9996Z", 18),  # on a whole millisecond it is 2017
+        ("2017-01-01T00:00:00Z", 18),
+        ("2199-12-31T23:59:59Z", 18),
+    ],
+)
+def test_a_receiver_knows_the_leap_seconds_of_its_epoch(tmp_path, utc, leap_s):
+    assert gps_minus_utc_s(tmp_path, utc) == (leap_s, leap_s)
+    assert gps_minus_utc_s(tmp_path, utc, leap_seconds=18) == (18, 18)
+
+
+def gps_minus_utc_s(folder, utc, **parameters):
+    """Return what a receiver tells of it, and what the two times that it tells differ by, within a day."""
+    parameters |= {"link": "gps", "messages": ["NAV-TIMEGPS", "NAV-TIMEUTC"]}
+    with opened("gnss_receiver", folder, **parameters) as device:
+        device.read()
+        computer = os.open(folder / "gps", os.O_RDONLY | os.O_NOCTTY)
+        device.write({"epoch": (unix_s(utc), *LEO, *SPEED)}, 0.0)
+        gps, told = heard(computer, 2)
+        os.close(computer)
+    of_day_s = 3600 * told.hour + 60 * told.min + told.sec + told.nano * 1e-9
+    return gps.leapS, round(gps.iTOW * 1e-3 - of_day_s, 6) % 86_400
+
+
+def test_every_year_that_a_scenario_may_have_is_within_the_limits_of_an_epoch(tmp_path):
+    prepared = prepare("gnss_receiver", {"link": "gps"}, tmp_path)
+    [epoch] = [channel for channel in prepared.channels if channel.name == "epoch"]
+
+    assert epoch.limits[1] >= unix_s(f"{LAST_YEAR - 1}-12-31T23:59:59Z") + DURATION_S_MAX
 
 
 def test_an_epoch_is_brought_to_a_whole_millisecond_by_its_velocity():

@@ -1,5 +1,6 @@
 """What drivers read, before anybody sees it: shapes, numbers that are none, what becomes the newest sample."""
 
+import math
 from decimal import Decimal
 from fractions import Fraction
 
@@ -11,6 +12,7 @@ from madns_runtime.hardware import page
 from madns_runtime.hardware.contract import Channel, Sample
 from madns_runtime.hardware.intake import Intake, least_stale_age_s
 from madns_runtime.hardware.page import DevicePage
+from madns_runtime.hardware.records import SimulatedTime
 from madns_runtime.hardware.status import StatusLimits
 from madns_runtime.hardware.values import to_numbers, to_output
 
@@ -22,13 +24,18 @@ ITSELF.append(ITSELF)
 
 
 class Kept:
-    """Records that are kept."""
+    """Records that are kept, of a run that began at 0 s of this machine's clock."""
 
     def __init__(self):
-        self.samples = []
+        self.samples, self.events = [], []
+        self.time = SimulatedTime()
+        self.time.set(0.0, 0.0, 1.0)
 
     def sample(self, channel, number, taken_s, values, *, told_s):
         self.samples.append((channel, number, tuple(values)))
+
+    def event(self, event, now_s, **values):
+        self.events.append((event, now_s, values.get("channel")))
 
 
 def make_intake():
@@ -210,6 +217,18 @@ def test_a_value_of_another_shape_is_refused_as_it_comes_whatever_fault_is_in_fo
     assert kept.samples == []
 
 
+LARGE = (pytest.param(10**400, id="10**400"), pytest.param(-(10**400), id="-10**400"))
+
+
+@pytest.mark.parametrize("taken_s", [-1e300, -2e9, -math.inf, NAN, 11.0, "1", *LARGE])
+def test_a_time_that_is_none_or_to_come_or_beyond_any_age_is_refused_and_reaches_nobody(taken_s):
+    intake, device_page, kept = make_intake()
+    with pytest.raises(PluginError, match="taken_s: expected a time until now, 10.0000"):
+        intake.take(Sample(values={"level": 1.0}, taken_s=taken_s), 10.0)
+
+    assert (device_page.read("level").number, kept.samples) == (0, [])
+
+
 def test_samples_that_a_delay_holds_at_the_end_are_counted():
     intake, _, kept = make_intake()
     intake.insert_fault("delay", 5.0)
@@ -223,16 +242,11 @@ def test_samples_that_a_delay_holds_at_the_end_are_counted():
 
 def test_frames_that_are_the_same_for_too_long_are_frozen_and_pass_a_fault_of_numbers():
     line = Channel(name="line", is_frame=True, passing="queue")
-    events, sent = [], []
-
-    class Told(Kept):
-        def event(self, event, now_s, **values):
-            events.append((event, now_s, values["channel"]))
-
+    kept, sent = Kept(), []
     intake = Intake(
         (line, LEVEL),
         DevicePage([line, LEVEL]),
-        Told(),
+        kept,
         seed=[1],
         frozen_s={"line": 2.0},
         pass_on=lambda message: sent.append(message[-1]) or 0,
@@ -242,8 +256,39 @@ def test_frames_that_are_the_same_for_too_long_are_frozen_and_pass_a_fault_of_nu
         intake.take(Sample(values={"line": data}, taken_s=float(second)), float(second))
 
     assert sent == [b"one", b"two", b"two", b"two", b"two", b"one"]
-    assert events == [("frozen", 3.0, "line")]
+    assert kept.events == [("frozen", 3.0, "line")]
     assert intake.summary()["frozen"] == {"line": 1}
+
+
+@pytest.mark.parametrize("came_s", [0.0, 1.0, math.inf])
+def test_an_input_that_does_not_come_while_others_do_is_frozen_once(came_s):
+    kept, device_page = Kept(), DevicePage([FIELD, LEVEL])
+    intake = Intake(
+        (FIELD, LEVEL), device_page, kept, seed=[1], frozen_s={"field": 3.0}, pass_on=len
+    )
+    device_page.header[page.OPENED_S] = 1.0  # behind the begin of the run
+    for second in range(1, 10):
+        values = {"level": float(second)}
+        if second == came_s:
+            values["field"] = (1.0, 2.0, 3.0)
+        intake.take(Sample(values=values, taken_s=float(second)), float(second))
+
+    assert kept.events == [("frozen", 4.0, "field")]
+    assert intake.summary()["frozen"] == {"field": 1}
+
+
+@pytest.mark.parametrize(("begun_s", "frozen"), [(math.nan, 0), (8.0, 0), (6.0, 1)])
+def test_time_before_the_run_and_after_it_freezes_no_input(begun_s, frozen):
+    kept = Kept()
+    kept.time.set(begun_s, 0.0, 1.0)
+    kept.time.end_s = 4.0
+    intake = Intake(
+        (FIELD, LEVEL), DevicePage([FIELD]), kept, seed=[1], frozen_s={"level": 3.0}, pass_on=len
+    )
+    for second in (*range(10), *range(13, 20)):
+        intake.take(Sample(values={"field": (float(second),) * 3}, taken_s=0.0), float(second))
+
+    assert intake.summary()["frozen"] == {"level": frozen}
 
 
 def test_frames_are_numbered_on_by_the_process_that_takes_the_place_of_another():

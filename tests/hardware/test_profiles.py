@@ -19,6 +19,7 @@ from madns_runtime.hardware.outbox import USERS_NAMED_MAX
 from madns_runtime.hardware.outputs import DeviceOutputs
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.profiles import (
+    DECLINED,
     POINT_COUNTS,
     POINTS_MAX,
     UNDERRUNS,
@@ -185,12 +186,23 @@ def test_counts_are_told_by_output():
     assert set(told) == {"coil", "line"}
 
 
+def test_points_of_which_nothing_became_are_lost_with_the_process_that_had_them():
+    ends = {"played": 2, "skipped": 3, "replaced": 4, "lost": 5, "unplayed": 6, DECLINED: 7}
+    counts = {"points": 40, "refused": 8, **ends}
+
+    told = counts_by_channel({count_name(word, "coil"): n for word, n in counts.items()})["coil"]
+
+    assert (told["lost"], told["refused"]) == (18, 15)
+    assert sum(told[word] for word in ends if word != DECLINED) + 7 == told["points"] == 40
+    assert set(told) == {*POINT_COUNTS, UNDERRUNS}
+
+
 def test_what_is_counted_of_the_longest_name_has_room_for_all_of_it():
     """What is cut off would tell the points of one output under several names, and none of them as late."""
     name = "a" * NAME_CHARACTERS_MAX
     assert Channel(name=name).faults() == [] != Channel(name=f"{name}a").faults()
 
-    counted = [count_name(word, name) for word in (*POINT_COUNTS, UNDERRUNS)]
+    counted = [count_name(word, name) for word in (*POINT_COUNTS, UNDERRUNS, DECLINED)]
 
     assert max(map(len, (*counted, f"{FROZEN}{name}", f"{name}{NOT_FINITE}"))) <= NAME_BYTES
 
@@ -201,13 +213,13 @@ def test_a_device_of_as_many_outputs_as_there_may_be_has_each_count_of_each():
         counts.add(missed_name(f"agent-{number:03d}"))
     for number in range(CHANNELS_MAX):
         counts.add(f"coil_{number}_limited")
-        for word in (*POINT_COUNTS, UNDERRUNS):
+        for word in (*POINT_COUNTS, UNDERRUNS, DECLINED):
             counts.add(count_name(word, f"coil_{number}"))
 
     told = counts.read()
     assert REST not in told
     assert set(counts_by_channel(told)) == {f"coil_{number}" for number in range(CHANNELS_MAX)}
-    assert all(set(each.values()) == {1} for each in counts_by_channel(told).values())
+    assert all(each["played"] == 1 for each in counts_by_channel(told).values())
 
 
 def test_a_kind_that_makes_safe_needs_a_safe_value():

@@ -76,3 +76,10 @@ def test_a_next_time_is_a_number_or_none(told, time_s):
     tape.next_s = lambda: told
 
     assert simulated.next_of(tape) == time_s
+
+
+def test_of_samples_that_are_finite_any_number_may_be_of_one_time():
+    tape = Tape([5.0] * (3 * COUNT_MAX))
+    tape.is_finite = True
+
+    assert passed_over(tape) == 3 * COUNT_MAX

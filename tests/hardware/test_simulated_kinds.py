@@ -10,6 +10,7 @@ import pytest
 
 from madns_runtime.config import Agents, DeviceLaunch, RunConfig
 from madns_runtime.errors import PluginError
+from madns_runtime.hardware import simulated
 from madns_runtime.hardware.contract import Sample
 from madns_runtime.hardware.inline import InlineDevice
 from madns_runtime.hardware.kind_registry import prepare
@@ -19,12 +20,17 @@ from madns_runtime.recording.reader import read_stream
 from madns_runtime.recording.record_files import RecordFiles
 from madns_runtime.recording.recorder import Recorder
 from madns_runtime.recording.run_journal import RunJournal
+from madns_runtime.recording.stream_file import path_of
 from tests.hardware.driving import opened
 
 CHANNELS = [
     {"name": "gyro", "unit": "rad/s", "components": ["x", "y", "z"], "elements": [{"noise": 0.1}] * 3},
     {"name": "level", "elements": [{"shape": "sine", "amplitude": 2.0, "offset": 1.0}]},
 ]  # fmt: skip
+TICKS_HEAD = (
+    '{"schema":1,"stream":"ticks","shape":"array","fields":['
+    '{"name":"tick","unit":"","kind":"int"},{"name":"lateness_us","unit":"us","kind":"int"}]}'
+)
 CONFIG = RunConfig(
     run="0001-r", scenario="s", simulation="counter", base_directory="", agents=Agents(count=1)
 )
@@ -121,6 +127,28 @@ def test_playback_gives_the_recorded_values_at_their_own_times_and_ages(tmp_path
     assert sorted(found) == sorted(told)
     handed_on = [t_s + age_us * 1e-6 for _, t_s, age_us, _ in found]
     assert handed_on == sorted(handed_on)
+
+
+def test_playback_goes_through_the_files_of_all_processes_that_the_device_had(tmp_path):
+    told = record(tmp_path, {"gyro": 0.0015, "level": 0.03})
+    for name in ("gyro", "level"):
+        head, *lines = (tmp_path / f"{name}.jsonl").read_text().splitlines(keepends=True)
+        for number, part in ((1, lines[:9]), (2, lines[9:60]), (10, lines[60:])):
+            path_of(tmp_path, name, number).write_text("".join([head, *part]))
+        path_of(tmp_path, name, 3).touch()  # of a process that was killed before it wrote
+    with opened("playback", tmp_path, directory=".") as device:
+        found = []
+        while (next_s := device.next_s()) != math.inf:
+            [(name, value)] = device.sample_at(next_s).values.items()
+            found.append((name, tuple(value) if isinstance(value, list) else (value,)))
+
+    for name in ("gyro", "level"):
+        values = [numbers for channel, _, _, numbers in told if channel == name]
+        assert [numbers for channel, numbers in found if channel == name] == values
+    schema = (tmp_path / "gyro.jsonl").read_text().splitlines()[0]
+    path_of(tmp_path, "level", 11).write_text(schema)
+    with pytest.raises(PluginError, match=r"level.11.jsonl: expected the fields of level.jsonl"):
+        prepare("playback", {"directory": "."}, tmp_path)
 
 
 def test_a_playback_recorded_anew_is_the_same_to_the_microsecond(tmp_path):
@@ -257,11 +285,7 @@ def test_a_playback_begins_where_it_is_told_and_refuses_an_empty_folder(tmp_path
 
 def test_a_playback_with_ticks_gives_each_sample_in_the_tick_that_could_find_it(tmp_path):
     told = record(tmp_path, {"gyro": 0.0015, "level": 0.03})
-    (tmp_path / "ticks.jsonl").write_text(
-        '{"schema":1,"stream":"ticks","shape":"array","fields":['
-        '{"name":"tick","unit":"","kind":"int"},{"name":"lateness_us","unit":"us","kind":"int"}]}\n'
-        "[0,100]\n[1,30000]\n[3,0]\n"
-    )
+    (tmp_path / "ticks.jsonl").write_text(f"{TICKS_HEAD}\n[0,100]\n[1,30000]\n[3,0]\n")
     settings = {"directory": ".", "ticks": "ticks.jsonl", "tick_hz": 10.0, "phase_s": 0.05}
     with opened("playback", tmp_path, **settings) as device:
         found = []
@@ -274,6 +298,19 @@ def test_a_playback_with_ticks_gives_each_sample_in_the_tick_that_could_find_it(
     assert all(handed_s <= woke_s[next_s] + 2e-6 for next_s, handed_s in found)
     handed_s = sorted(t_s + age_us * 1e-6 for _, t_s, age_us, _ in told)
     assert len(found) == sum(each <= 0.35 + 1e-6 for each in handed_s)  # later ones nobody found
+
+
+def test_however_many_samples_a_tick_found_they_are_played_in_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulated, "AT_ONCE_MAX", 50)
+    record(tmp_path, {"gyro": 0.0015, "level": 0.03})
+    (tmp_path / "ticks.jsonl").write_text(f"{TICKS_HEAD}\n[0,0]\n[4,0]\n")
+    settings = {"directory": ".", "ticks": "ticks.jsonl", "tick_hz": 1.0}
+    device, clock = inline(tmp_path / "again", prepare("playback", settings, tmp_path))
+    device.open()
+    clock[0] = 4.0
+    device.advance(4.0)
+
+    assert device.close()["samples"] == 399  # but for one that was handed on later
 
 
 def test_a_playback_of_lockstep_gives_a_sample_between_two_ticks_when_it_was_handed_on(tmp_path):

@@ -48,3 +48,24 @@ def test_samples_behind_the_last_tick_are_counted_as_not_seen(tmp_path):
     counts = {d["name"]: (d["records"], d["compared"], d["left_out"]) for d in told["devices"]}
     assert counts == {"agent-01/imu.a": (6, 4, 2), "agent-01/imu.b": (6, 4, 2)}
     assert (done.returncode, told["same"]) == (0, True), done.stderr
+
+
+def test_the_records_of_all_processes_that_a_device_had_are_played_and_compared(tmp_path):
+    (tmp_path / "again.yaml").write_text(SCENARIO)
+    cosmos = CosmosCommand(tmp_path)
+    _, document = cosmos.run(tmp_path / "again.yaml")
+    folder = cosmos.directory(document) / "devices" / "agent-01" / "imu"
+    for name in ("a", "b", "device_state"):
+        head, *lines = (folder / f"{name}.jsonl").read_text().splitlines(keepends=True)
+        (folder / f"{name}.jsonl").write_text("".join([head, *lines[:2]]))
+        (folder / f"{name}.2.jsonl").write_text("".join([head, *lines[2:]]))
+
+    done = cosmos("rerun", document["run"], "--json", "--quiet")
+    told = json.loads(done.stdout)
+
+    counts = {d["name"]: (d["records"], d["compared"], d["different"]) for d in told["devices"]}
+    assert counts == {"agent-01/imu.a": (4, 4, 0), "agent-01/imu.b": (4, 4, 0)}
+    assert [each for each in told["remarks"] if each.startswith("agent-01/imu:")] == [
+        "agent-01/imu: its process was started anew, 1 time: what an earlier one had not written when it ended is"
+        " in no rerun"
+    ]

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -77,8 +78,14 @@ def test_the_guardian_sees_the_end_without_a_descriptor(child, no_descriptors):
 
 
 def test_a_child_is_waited_for_without_a_descriptor(child, no_descriptors):
-    assert not wait_for(child.pid, time.monotonic())
+    assert wait_for(child.pid, time.monotonic()) is None
     child.stdin.close()
 
-    assert wait_for(child.pid, time.monotonic() + PATIENCE_S)
-    assert wait_for(child.pid, time.monotonic() + PATIENCE_S)
+    assert wait_for(child.pid, time.monotonic() + PATIENCE_S) == 0
+    assert wait_for(child.pid, time.monotonic() + PATIENCE_S) == 0  # let go of before
+
+
+def test_a_child_that_was_killed_is_told_from_one_that_ended(child):
+    child.kill()
+
+    assert wait_for(child.pid, time.monotonic() + PATIENCE_S) == -signal.SIGKILL

@@ -112,6 +112,17 @@ def test_a_rate_is_of_the_time_that_a_run_which_was_stopped_had(run):
     assert of_name(json.loads(again.stdout), "rate") == check
 
 
+def test_what_was_to_be_looked_for_after_the_end_of_a_run_that_was_stopped_is_no_pass(run):
+    calm = "{name: calm, event: emergency, must: not_occur, from_s: 3, agents: [host]}"
+
+    code, document = run("lockstep", calm, timeline="timeline: [{at_s: 1, action: stop}]\n")
+
+    assert code == 4
+    assert of_name(document, "calm")["got"] is None
+    assert "calm not measured" in document["verdict"]
+    assert "(the run ended at 1 s, before its from_s)" in document["verdict"]
+
+
 def test_a_rate_is_of_the_time_that_a_run_which_a_check_ended_had(run):
     few = "{name: few, stream: round_trips, statistic: count, below: 40, stop_when_broken: true}"
     rate = "{name: rate, stream: round_trips, statistic: rate, within: [19, 21]}"

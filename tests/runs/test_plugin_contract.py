@@ -2,6 +2,7 @@
 
 import json
 import re
+import signal
 
 import pytest
 from harness.cosmos_command import LOOSE, CosmosCommand
@@ -101,6 +102,8 @@ class A(AgentSimulation):
             os._exit(0)
         if self.evil == "crash" and self.context.name == "agent-01" and tick.index >= 3:
             os.kill(os.getpid(), signal.SIGSEGV)
+        if self.evil == "nameless" and self.context.name == "agent-01" and tick.index >= 3:
+            os.kill(os.getpid(), signal.SIGRTMIN + 1)
         is_forking = self.evil.startswith("fork") and not self.has_forked
         if is_forking and self.context.name == "agent-01":
             self.has_forked = True
@@ -198,6 +201,14 @@ def test_an_agent_that_is_killed_in_a_call_is_told_with_the_call(tmp_path):
     # As above.
     told = r"killed by SIGSEGV in the step of agent-01 at t = \d+(\.\d+)? s"
     assert re.search(told, result["reason"])
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_an_agent_that_is_killed_by_a_signal_without_a_name_costs_no_other(tmp_path, mode):
+    result = run(tmp_path, "nameless", SOME, f"time.mode={mode}", "on_agent_loss=continue")
+
+    assert (result["status"], result["agents"]["lost"]) == ("complete", ["agent-01"])
+    assert f"killed by signal {signal.SIGRTMIN + 1} in the " in json.dumps(result)
 
 
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])

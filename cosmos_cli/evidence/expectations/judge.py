@@ -26,6 +26,8 @@ from cosmos_cli.evidence.expectations.held_times import HeldTimes, TooManyChange
 from cosmos_cli.evidence.expectations.outcomes import (
     ExpectationOutcome,
     outcome_of_event,
+    remark_on_end,
+    why_not_flown,
     worst_result,
 )
 from cosmos_cli.evidence.expectations.records import Batch, RecordSource
@@ -58,11 +60,13 @@ class JudgedExpectations:
     """Remarks on words that are looked for and that no record has, where any may come: they may be misspelt."""
     of_strangers: tuple[str, ...] = ()
     """Remarks on records about names that are no agents: expectations of agents do not judge them."""
+    of_ends: tuple[str, ...] = ()
+    """Remarks on times that are asked for and that lie in part behind the run's end."""
 
     def remarks(self) -> tuple[str, ...]:
-        """Return a remark per expectation that was not judged, per event whose word is nowhere, and on records left out."""
+        """Return a remark per expectation that was not judged, per event whose word is nowhere, on records left out, and on times not flown."""
         told = (f"{name}: not judged: {why}" for name, why in self.not_judged.items())
-        return (*told, *self.unseen, *self.of_strangers)
+        return (*told, *self.unseen, *self.of_strangers, *self.of_ends)
 
     def told_not_judged(self) -> list[dict[str, str]]:
         """Return the same as run.json holds it."""
@@ -128,6 +132,7 @@ def judge_expectations(
         not_judged=not_judged,
         unseen=tuple(filter(None, (each.words.remark() for each in followed))),
         of_strangers=tuple(strangers.remarks(judged)),
+        of_ends=tuple(filter(None, (remark_on_end(each, duration_s) for each in judged))),
     )
 
 
@@ -177,6 +182,7 @@ class _Followed:
         """End of the stretch of time that a rate is of, s."""
         self._has_stream = bool(source.tables_of(expectation.stream))
         self._fault = _fault_of(expectation, source)
+        self._not_flown = why_not_flown(expectation, duration_s)
         units = {
             name: source.unit_of(expectation.stream, expectation.field, name)
             for name in self._names or (NOBODY,)
@@ -302,7 +308,8 @@ class _Followed:
     def _may_be_none(self) -> bool:
         """Whether no record is an answer, too: of how many there are, and whether something happened."""
         is_counted = bool(self.expectation.event) or self.expectation.statistic in OF_NUMBERS
-        return is_counted and self._has_stream and self._fault is None
+        is_answer = is_counted and not self._not_flown
+        return is_answer and self._has_stream and self._fault is None
 
     def _outcome(
         self,
@@ -319,7 +326,9 @@ class _Followed:
             )
         got, t_s = (None, None) if accumulator is None else accumulator.result()
         if got is None or not np.isfinite(got):
-            return ExpectationOutcome(got=None, t_s=t_s, passed=False, why=self._fault or "")
+            return ExpectationOutcome(
+                got=None, t_s=t_s, passed=False, why=self._fault or self._not_flown
+            )
         bounds = self._bounds(agent)
         passed = got == 0.0 if bounds.text is not None else bounds.holds(got)
         is_value = expectation.statistic not in (*OF_NUMBERS, *OF_TIMES)

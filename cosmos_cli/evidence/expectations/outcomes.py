@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from cosmos_cli.evidence.expectations.accumulators import Occurrences
 from cosmos_cli.evidence.verdict import CheckResult
+from cosmos_cli.models.check_rules import OF_NUMBERS
 from cosmos_cli.models.expectation import Expectation, owner_of
 from madns_runtime.conditions.condition import HOST
 from madns_runtime.written_times import later_s
@@ -28,6 +29,21 @@ class ExpectationOutcome:
     """Why there is none, if that is known."""
     latest_s: float | None = None
     """Until when an event had to come, s, of this agent; None for any time of the run."""
+
+
+def why_not_flown(expectation: Expectation, duration_s: float) -> str:
+    """Return why nothing can be said of an expectation whose times lie behind the end of a run; empty if they do not."""
+    is_behind = expectation.from_s is not None and expectation.from_s >= duration_s
+    return f"the run ended at {duration_s:g} s, before its from_s" if is_behind else ""
+
+
+def remark_on_end(expectation: Expectation, duration_s: float) -> str:
+    """Return a remark on one that no record answers, too, and whose times a run had in part; empty for all others."""
+    is_answered = expectation.must == "not_occur" or expectation.statistic in OF_NUMBERS
+    end_s = expectation.to_s
+    if not is_answered or end_s is None or end_s <= duration_s:
+        return ""
+    return f"{expectation.name}: judged until {duration_s:g} s, when the run ended, and not until {end_s:g} s"
 
 
 def outcome_of_event(

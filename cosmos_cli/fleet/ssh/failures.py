@@ -7,8 +7,8 @@ paramiko tells many cases apart by their texts only; this is the one place that 
 from __future__ import annotations
 
 import errno
-import socket
 from pathlib import Path
+from socket import gaierror
 
 from cosmos_cli.fleet.failure import FailureKind, MachineFailure
 from cosmos_cli.fleet.ssh.known_hosts import HostKey, KeyVerdict, KnownHost, Standing
@@ -40,7 +40,7 @@ def opening_failure(
         return error
     if not has_spoken and isinstance(error, ENDS):  # while paramiko greeted
         return _silent(where)
-    if isinstance(error, socket.gaierror):
+    if isinstance(error, gaierror):
         return MachineFailure(
             FailureKind.UNREACHABLE,
             f"{where}: the name is not known ({error.strerror})",

@@ -40,7 +40,7 @@ class MachineDevice:
     hang_s: Annotated[float, Ge(0.1), Le(3600)] = 15.0
     """A device that says nothing for so long is given up: its process is killed and started anew."""
     frozen_s: dict[str, Annotated[float, Gt(0)]] = field(default_factory=dict)
-    """By input: values unchanged for so many seconds are frozen."""
+    """By input: one that has not changed, or not come, for so many seconds is frozen."""
     parameters: dict[str, Any] = field(default_factory=dict)
     """The kind's own."""
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from madns_runtime.errors import ConfigurationError
 from madns_runtime.hardware.calibration.result import SI_UNITS, ChannelSamples, SensorName
-from madns_runtime.hardware.kinds.playback import HEAD
+from madns_runtime.hardware.contract import Channel
+from madns_runtime.hardware.kinds.playback import streams_of
 from madns_runtime.hardware.units import factor_of, unit_fault
-from madns_runtime.recording.reader import StreamReading, read_columns, read_stream
+from madns_runtime.recording.reader import read_columns
 
-FILES_MAX = 64
+VECTOR: Final = 3
 
 
 def read_samples(
@@ -23,7 +25,7 @@ def read_samples(
     limits: tuple[float, float] | None,
 ) -> ChannelSamples:
     """
-    Return what a sensor's channel gave, without samples that hold no numbers.
+    Return what a sensor's channel gave, to all processes that its device had, without samples that hold no numbers.
 
     Args:
         folder: Of one device's records.
@@ -34,34 +36,40 @@ def read_samples(
     Raises:
         ConfigurationError: The folder holds no such channel, or several.
         MachineError: A file cannot be read.
+        PluginError: The files of a channel are of different recordings.
     """
-    stream = _stream(folder, sensor, channel)
-    names = stream.field_names
-    columns = read_columns(stream.path)
-    values = np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in names[3:]])
-    t_s = np.asarray(columns["t_s"], dtype=np.float64)
-    is_whole = np.isfinite(values).all(axis=1) & np.isfinite(t_s)
+    found, files = _stream(folder, sensor, channel)
+    parts = [columns for path in files if (columns := read_columns(path))]
+    t_s, _, _, *values = (
+        np.concatenate([np.asarray(columns[name], dtype=np.float64) for columns in parts])
+        for name in parts[0]
+    )
+    vectors = np.column_stack(values)
+    is_whole = np.isfinite(vectors).all(axis=1) & np.isfinite(t_s)
     return ChannelSamples(
-        name=stream.path.stem,
-        unit=_unit(stream),
+        name=found.name,
+        unit=found.unit,
         t_s=t_s[is_whole],
-        values=values[is_whole],
+        values=vectors[is_whole],
         limits=limits,
     )
 
 
-def _stream(folder: Path, sensor: SensorName, channel: str | None) -> StreamReading:
+def _stream(
+    folder: Path, sensor: SensorName, channel: str | None
+) -> tuple[Channel, tuple[Path, ...]]:
+    """Return a sensor's channel, with its files in their order."""
     if not folder.is_dir():
         raise ConfigurationError(f"{folder}: expected a folder of a device's records")
     vectors = [
-        stream
-        for path in sorted(folder.glob("*.jsonl"))[:FILES_MAX]
-        if (stream := read_stream(path)).field_names[:3] == HEAD and len(stream.field_names) == 6
+        (each, files)
+        for each, files in streams_of(folder)
+        if each.direction == "in" and each.size == VECTOR
     ]
-    known = ", ".join(f"{each.path.stem} ({_unit(each) or 'no unit'})" for each in vectors)
+    known = ", ".join(f"{each.name} ({each.unit or 'no unit'})" for each, _ in vectors)
     wanted = SI_UNITS[sensor]
     if channel is None:
-        fitting = [each for each in vectors if factor_of(_unit(each), wanted) is not None]
+        fitting = [each for each in vectors if factor_of(each[0].unit, wanted) is not None]
         if len(fitting) != 1:
             count = "several channels" if fitting else "no channel"
             raise ConfigurationError(
@@ -69,15 +77,11 @@ def _stream(folder: Path, sensor: SensorName, channel: str | None) -> StreamRead
                 " --channel names one"
             )
         return fitting[0]
-    found = [each for each in vectors if each.path.stem == channel]
+    found = [each for each in vectors if each[0].name == channel]
     if not found:
         raise ConfigurationError(
             f"{folder}: no input {channel!r} of three numbers; it has {known or 'none'}"
         )
-    if fault := unit_fault(_unit(found[0]), wanted):
+    if fault := unit_fault(found[0][0].unit, wanted):
         raise ConfigurationError(f"{folder}: {channel}: {fault}")
     return found[0]
-
-
-def _unit(stream: StreamReading) -> str:
-    return str(stream.schema["fields"][3]["unit"])

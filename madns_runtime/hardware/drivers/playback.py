@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +22,8 @@ ROUNDING_S: Final = 1e-6
 class PlaybackDevice(SimulatedDevice):
     """Gives each recorded sample when it was handed on, with the time at which it was taken."""
 
+    is_finite = True  # all samples that one tick found are of its time
+
     def open(self) -> str:
         """Begin the recording."""
         found_at = _finder(self.parameters)
@@ -29,8 +31,8 @@ class PlaybackDevice(SimulatedDevice):
         self._has_inputs = any(channel.direction == "in" for channel, _ in channels)
         self._samples: Iterator[tuple[float, Sample]] = heapq.merge(
             *(
-                self._samples_of(channel, path, found_at)
-                for channel, path in channels
+                self._samples_of(channel, files, found_at)
+                for channel, files in channels
                 if channel.direction == "in"
             ),
             key=lambda pair: pair[0],
@@ -43,14 +45,16 @@ class PlaybackDevice(SimulatedDevice):
         self._samples, self._next = iter(()), None
 
     def _samples_of(
-        self, channel: Channel, path: Path, found_at: Callable[[float], float]
+        self, channel: Channel, files: Sequence[Path], found_at: Callable[[float], float]
     ) -> Iterator[tuple[float, Sample]]:
-        """Yield the samples of one input with their times, and count the lines of its file so far that were none."""
-        stream, counted = read_stream(path), 0
-        for found in _samples(channel, stream, self.parameters, found_at):
-            yield found
-            counted += self._count_damaged(stream.passed, counted)  # a run may end before it does
-        self._count_damaged(stream.passed, counted)
+        """Yield the samples of one input with their times, and count the lines of its files so far that were none."""
+        for path in files:
+            stream, counted = read_stream(path), 0
+            for found in _samples(channel, stream, self.parameters, found_at):
+                yield found
+                # Now already, as a run may end before the recording does.
+                counted += self._count_damaged(stream.passed, counted)
+            self._count_damaged(stream.passed, counted)
 
     def _count_damaged(self, passed: StreamState, counted: int) -> int:
         """Count the lines that were none and are not *counted* yet, and return how many they are."""

@@ -13,8 +13,8 @@ from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 from madns_runtime.hardware.gnss_messages import GnssMessage
 
 BaudRate = Literal[4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600]
-UTC_S_MAX = 4_102_444_800.0
-"""The end of 2099."""
+UTC_S_MAX = 7_605_187_200.0
+"""The end of 2210: a run begins before 2200 and lasts ten years at most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,8 +34,8 @@ class GnssReceiverParameters:
         "NAV-TIMEUTC",
     )
     """Messages of each epoch, in this order."""
-    leap_seconds: Annotated[int, Ge(0), Le(127)] = 18
-    """GPS time minus UTC, s: 18 since 2017."""
+    leap_seconds: Annotated[int, Ge(0), Le(127)] | None = None
+    """GPS time minus UTC, s; without it what it was at each epoch: 13 in 2000, 18 since 2017."""
     position_accuracy_m: Annotated[float, Ge(0), Le(10_000)] = 2.5
     """Accuracy that it tells of position; no error is added."""
     velocity_accuracy_m_s: Annotated[float, Ge(0), Le(1000)] = 0.05

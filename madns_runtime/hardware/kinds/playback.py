@@ -6,7 +6,7 @@ Outputs that were recorded are there as well: they take what they are given, put
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -17,6 +17,7 @@ from madns_runtime.errors import PluginError
 from madns_runtime.hardware.contract import Channel, DeviceKind
 from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.recording.reader import read_stream
+from madns_runtime.recording.stream_file import files_of
 
 HEAD: Final = ("t_s", "number", "age_us")
 """First fields of an input's stream."""
@@ -80,22 +81,44 @@ def _passing(channel: Channel, parameters: PlaybackParameters) -> Literal["newes
     return "queue" if channel.name in parameters.queues else channel.passing
 
 
-def streams_of(directory: Path) -> list[tuple[Channel, Path]]:
-    """Return the channels of which a folder holds streams, with their files: of too many, one more than a device has."""
-    found: list[tuple[Channel, Path]] = []
-    for path in sorted(directory.glob("*.jsonl")):
+def streams_of(directory: Path) -> list[tuple[Channel, tuple[Path, ...]]]:
+    """
+    Return the channels of which a folder holds streams: of too many, one more than a device has.
+
+    With each come its files in their order: a device's process that was started anew has begun another one.
+
+    Raises:
+        MachineError: A file cannot be read.
+        PluginError: The files of a stream have not the same fields, so that they are of different recordings.
+    """
+    found: list[tuple[Channel, tuple[Path, ...]]] = []
+    for name in sorted({path.name.partition(".")[0] for path in directory.glob("*.jsonl")}):
         if len(found) > CHANNELS_MAX:
             break
-        fields = read_stream(path).schema.get("fields", ())
-        names = tuple(field["name"] for field in fields)
-        if not path.stem.isidentifier():
+        if not name.isidentifier():
             continue
+        files = files_of(directory, name)
+        fields = _fields_of(files)
+        names = tuple(field["name"] for field in fields)
         if names[: len(HEAD)] == HEAD:
-            found.append((_channel(path.stem, fields[len(HEAD) :]), path))
+            found.append((_channel(name, fields[len(HEAD) :]), files))
         elif names[: len(OUTPUT_HEAD)] == OUTPUT_HEAD:
-            channel = _channel(path.stem, fields[len(OUTPUT_HEAD) :])
-            found.append((replace(channel, direction="out"), path))
+            channel = _channel(name, fields[len(OUTPUT_HEAD) :])
+            found.append((replace(channel, direction="out"), files))
     return found
+
+
+def _fields_of(files: Sequence[Path]) -> Sequence[Any]:
+    """Return the fields of a stream; a process that was killed may have left a file without any."""
+    first: Sequence[Any] = ()
+    for path in files:
+        fields = read_stream(path).schema.get("fields", ())
+        first = first or fields
+        if fields and fields != first:
+            raise PluginError(
+                f"{path}: expected the fields of {files[0].name}, found others: are they of different recordings?"
+            )
+    return first
 
 
 def _channel(name: str, fields: Any) -> Channel:

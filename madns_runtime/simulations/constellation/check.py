@@ -1,7 +1,7 @@
 """
 Faults of a constellation scenario that bounds cannot tell, found before anything is launched.
 
-Element sets have faults that their syntax does not show: SGP4 itself is asked, at the scenario's start and end.
+Element sets have faults that their syntax does not show: SGP4 itself is asked, from the scenario's start to its end.
 Imports neither scipy nor numpy: `cosmos validate` answers at once.
 """
 
@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
 
 from madns_runtime.errors import ConfigurationError, MissingExtraError
 from madns_runtime.plugin.api import DeviceUse, PlaceUse
 from madns_runtime.simulations.constellation.check_flight import flight_faults, rate_faults
+from madns_runtime.simulations.constellation.check_slots import node_faults, slot_record_faults
 from madns_runtime.simulations.constellation.check_vehicles import (
     board_faults,
     code_faults,
@@ -23,11 +25,11 @@ from madns_runtime.simulations.constellation.check_vehicles import (
 from madns_runtime.simulations.constellation.device_uses import uses_devices, uses_of
 from madns_runtime.simulations.constellation.parameters import (
     KNOTS_MAX,
+    PROPAGATORS,
     ConstellationParameters,
     CustomPropagator,
     ElementSetSatellites,
-    NumbaPropagator,
-    ScipyPropagator,
+    PropagatorProperties,
     Sgp4Propagator,
 )
 from madns_runtime.simulations.constellation.place_uses import place_uses_of, uses_places
@@ -40,7 +42,7 @@ from madns_runtime.simulations.constellation.vehicle.truth_buffer import (
     KNOTS_HELD_MAX,
     SEGMENTS_MAX,
 )
-from madns_runtime.simulations.constellation.vehicles import DEFAULT, rules_with_even_slots
+from madns_runtime.simulations.constellation.vehicles import DEFAULT
 
 FIELD = "parameters.satellites.elements"
 AGE_DAYS_MAX = 366.0
@@ -71,7 +73,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
         agents: Number of agents, each of which needs a satellite.
         base_directory: Folder of the scenario.
         names: The agents' names; globs are not judged without them.
-        duration_s: Of the run: SGP4 is asked for its end, too.
+        duration_s: Of the run: SGP4 is asked for all of it.
         is_lockstep: Whether simulated time waits for everybody.
         tick_hz: Of the ticks; rates are not judged without it.
     """
@@ -83,6 +85,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
         pairs = list(zip(names, chosen.names, strict=False))
         faults += set_faults(parameters, chosen, duration_s)
         faults += field_year_remarks(parameters, chosen.epoch_utc)
+        faults += node_faults(parameters, chosen, names)
     except ConfigurationError as error:
         faults += str(error).splitlines()
     faults += _propagator_faults(parameters, folder)
@@ -92,7 +95,7 @@ def find_faults(  # noqa: PLR0913 - what a scenario is, most by name; see plugin
     faults += board_faults(parameters, pairs)
     faults += flight_faults(parameters, pairs, folder, is_lockstep=is_lockstep)
     faults += rate_faults(parameters, tick_hz)
-    faults += _slot_faults(parameters)
+    faults += slot_record_faults(parameters)
     faults += _late_uplinks(parameters, duration_s)
     faults += _idle_coefficients(parameters)
     if parameters.recorded_agents is not None and not is_lockstep:
@@ -187,8 +190,9 @@ def _idle_coefficients(parameters: ConstellationParameters) -> list[str]:
     if isinstance(propagator, CustomPropagator) or "drag" in propagator.forces:
         return []
     why = "drag is not among parameters.propagator.forces"
-    if not isinstance(propagator, ScipyPropagator | NumbaPropagator):
-        why = f"{propagator.kind} knows no drag by it; kind: scipy does, with drag among its forces"
+    if not propagator.PROPERTIES.knows_drag:
+        others = _kinds(lambda each: each.knows_drag)
+        why = f"{propagator.kind} knows no drag by it; take kind: {others}, with drag among its forces"
     remarks = []
     for number, vehicle in enumerate(parameters.vehicles):
         given = [
@@ -201,31 +205,6 @@ def _idle_coefficients(parameters: ConstellationParameters) -> list[str]:
             for name in given[:1]
         ]
     return remarks
-
-
-def _slot_faults(parameters: ConstellationParameters) -> list[str]:
-    """Return why slot errors cannot be recorded."""
-    if parameters.record.slots_hz is None:
-        return []
-    rules = rules_with_even_slots(parameters)
-    if not rules:
-        return [
-            "parameters.record.slots_hz: expected flight software with settings {slots: even}, got none; "
-            "drop it, or let parameters.flight say so"
-        ]
-    spacings = [rule.settings.get("spacing_deg") for rule in rules]
-    for spacing in spacings:
-        if spacing is not None and type(spacing) not in (int, float):
-            return [
-                "parameters.record.slots_hz: expected a number of degrees as spacing_deg in settings with slots: even, "
-                f"got {spacing!r:.80}"
-            ]
-    if any(spacing != spacings[0] for spacing in spacings):
-        told = ", ".join(sorted({*map(str, spacings)}))
-        return [
-            f"parameters.record.slots_hz: expected one spacing_deg in all settings with slots: even, got {told}"
-        ]
-    return []
 
 
 def _segment_faults(parameters: ConstellationParameters) -> list[str]:
@@ -277,14 +256,15 @@ def _attitude_faults(parameters: ConstellationParameters) -> list[str]:
         if attitude is None:
             continue
         if by_engine and attitude.wheels is not None:
+            others = _kinds(lambda each: each.conserves_energy and not each.turns_bodies)
             faults.append(
                 f"{field}.wheels: {propagator.kind} does rigid bodies without wheels only; drop them, which "
-                "makes torques exact and without limit, or take kind: scipy or numba"
+                f"makes torques exact and without limit, or take kind: {others}"
             )
         if attitude.magnetorquers is not None and not propagator.PROPERTIES.follows_dipoles:
             faults.append(
                 f"{field}.magnetorquers: {propagator.kind} follows no magnetic dipole; drop them, or take "
-                "kind: scipy or numba"
+                f"kind: {_kinds(lambda each: each.follows_dipoles)}"
             )
         turn_deg = math.hypot(*attitude.rates_deg_s) * parameters.segments.knot_s
         if turn_deg >= 180.0:
@@ -293,6 +273,11 @@ def _attitude_faults(parameters: ConstellationParameters) -> list[str]:
                 f"{turn_deg:g} deg; a shorter segments.knot_s follows faster ones"
             )
     return faults
+
+
+def _kinds(are_meant: Callable[[PropagatorProperties], bool]) -> str:
+    """Return the kinds of propagators with some properties, as in: scipy or numba."""
+    return " or ".join(kind for kind, each in PROPAGATORS.items() if are_meant(each.PROPERTIES))
 
 
 def _missing_libraries(parameters: ConstellationParameters) -> list[str]:
@@ -376,8 +361,9 @@ def _sgp4_fault(
         from madns_runtime.simulations.constellation.truth.propagators.sgp4_records import why_not
     except MissingExtraError:
         return None  # told by itself, with the command that installs it
-    fault = why_not(element_set, epoch_utc, 0.0)
+    fault = why_not(element_set, epoch_utc)
     if fault is None and parameters.propagator.PROPERTIES.needs_element_sets:
         # Who falls meanwhile is lost at that time, as on_agent_loss says.
-        fault = why_not(element_set, epoch_utc, duration_s, may_fall=True)
+        knot_s = parameters.segments.knot_s
+        fault = why_not(element_set, epoch_utc, duration_s, knot_s=knot_s)
     return fault

@@ -10,7 +10,7 @@ are imported here.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, get_args, get_type_hints
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 
@@ -99,6 +99,8 @@ class PropagatorProperties:
     """Whether it integrates attitude itself, of bodies without wheels: `truth.propagators.attitude` does else."""
     follows_dipoles: bool = False
     """Whether bodies turn by their magnetorquers."""
+    knows_drag: bool = False
+    """Whether drag by a vehicle's ballistic coefficient may be among its forces."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,6 +112,7 @@ class ScipyPropagator:
         library="scipy",
         conserves_energy=True,
         follows_dipoles=True,
+        knows_drag=True,
     )
     can_maneuver: ClassVar[bool] = True
 
@@ -136,6 +139,7 @@ class NumbaPropagator:
         is_independent=True,
         conserves_energy=True,
         follows_dipoles=True,
+        knows_drag=True,
     )
     can_maneuver: ClassVar[bool] = True
 
@@ -214,6 +218,10 @@ AnyPropagator = (
     ScipyPropagator | NumbaPropagator | Sgp4Propagator | BasiliskPropagator | CustomPropagator
 )
 """All that there are: another one is a class of settings with its properties, and its engine's module."""
+PROPAGATORS: dict[str, type[AnyPropagator]] = {
+    get_args(get_type_hints(settings)["kind"])[0]: settings for settings in get_args(AnyPropagator)
+}
+"""The kind in a scenario -> its settings."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,6 +19,8 @@ GLOBS_KEPT = 1024
 """Lists of globs that are kept sorted out: each is asked for every agent."""
 EVEN_SLOTS = "even"
 """Value of the setting slots of flight software that keeps its agents evenly spaced, in their order."""
+SLOTS = (EVEN_SLOTS, "kept")
+"""Values of the setting slots."""
 DEFAULT = Vehicle()
 """Description of a vehicle that no entry describes."""
 

@@ -98,7 +98,8 @@ def test_a_file_that_may_not_be_read_is_told_and_the_rest_is_judged(ordinary, na
 
     assert summary.exit_code == 5
     assert f"{name}: not read: Permission denied" in summary.missing
-    assert summary.is_packed
+    is_in_package = name != "scenario.yaml"
+    assert summary.is_packed is not is_in_package  # what it alone can give is kept
 
 
 def test_a_stream_on_a_bad_disk_is_told_and_the_rest_is_judged_and_packaged(tmp_path, monkeypatch):
@@ -120,7 +121,9 @@ def test_a_stream_on_a_bad_disk_is_told_and_the_rest_is_judged_and_packaged(tmp_
     assert "agents/agent-01/ticks.jsonl: cannot be read: Input/output error" in summary.missing
     assert any(line.startswith("agent-01: ticks is missing") for line in summary.missing)
     assert summary.document["records"]["written"] > 0
-    assert summary.is_packed
+    assert summary.kept_member == f"{made.run.name}/agents/agent-01/ticks.jsonl"
+    made.run.bundle.unlink()
+    assert collect_run(made.run, processes=lambda: []).is_packed
 
 
 @pytest.mark.parametrize(
@@ -778,6 +781,42 @@ def test_stream_that_was_shortened_and_closed_again_is_named_every_time(tmp_path
 
     path.write_bytes(whole)
     assert again(made).exit_code == 0
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_package_that_alone_holds_records_as_they_were_is_kept_until_they_are_back(
+    tmp_path, is_there
+):
+    made = SyntheticRun(tmp_path).write()
+    finish(made)
+    path, package = made.stream("agent-01", "round_trips"), made.run.bundle.read_bytes()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    if not is_there:
+        path.unlink()
+
+    for _ in range(2):
+        summary = again(made)
+
+        assert (summary.exit_code, summary.is_packed) == (5, False)
+        assert summary.kept_member == "0001-synthetic/agents/agent-01/round_trips.jsonl"
+        assert made.run.bundle.read_bytes() == package
+    path.write_bytes(whole)
+    assert again(made).is_packed
+
+
+@pytest.mark.parametrize("is_cut", [True, False])
+def test_package_without_the_records_as_they_were_is_written_anew(tmp_path, is_cut):
+    made = SyntheticRun(tmp_path).write()
+    finish(made)
+    made.stream("agent-01", "round_trips").write_bytes(b"")
+    if is_cut:
+        made.run.bundle.write_bytes(made.run.bundle.read_bytes()[:100])
+    else:
+        made.run.bundle.unlink()
+
+    assert again(made).is_packed
+    assert again(made).is_packed
 
 
 @pytest.mark.parametrize("name", ["agents/agent-01/ticks.jsonl", "note.txt", "flown"])

@@ -45,6 +45,18 @@ def test_collect_of_a_cut_off_run_ends_with_5_and_names_what_is_missing(made, ca
     assert made.run.bundle.exists()
 
 
+def test_collect_tells_how_records_come_back_from_a_package_that_it_keeps_for_them(made, capsys):
+    finish(made)
+    made.stream("agent-01", "ticks").write_bytes(b"")
+
+    assert app.run(["collect", "1"]) == 5
+
+    err = capsys.readouterr().err
+    member = f"{made.run.name}/agents/agent-01/ticks.jsonl"
+    assert f"tar -xf {made.run.bundle} -C {made.run.path} --strip-components=1 {member};" in err
+    assert "packed:" not in err
+
+
 def test_collect_as_json_prints_run_json_alone(made, capsys):
     finish(made)
 
@@ -180,6 +192,21 @@ def test_report_of_a_run_that_is_not_collected_says_what_to_do(made, capsys):
     assert app.run(["report", "1"]) == 2
 
     assert "cosmos collect 1" in capsys.readouterr().err
+
+
+def test_judge_of_a_run_that_failed_is_no_pass_and_names_what_ended_it(made, tmp_path, capsys):
+    finish_run(made.run, made.result(status="failed", who="host", reason="boom"), made.expected)
+    checks = tmp_path / "checks.yaml"
+    checks.write_text(
+        "name: some\nsimulation: counter\nagents: {count: 2, tick_hz: 10}\ntime: {duration_s: 20}\n"
+        "checks: [{name: some, stream: round_trips, statistic: count, above: 1}]\n"
+    )
+
+    code = app.run(["judge", "1", "-s", str(checks), "--json"])
+
+    document = json.loads(capsys.readouterr().out)
+    assert (code, document["exit_code"]) == (1, 1)
+    assert document["verdict"] == "FAILED: host: boom; judged by what it recorded: 1 check holds"
 
 
 @pytest.mark.parametrize("verb", ["report", "judge", "tabulate", "rerun", "diff"])

@@ -34,6 +34,15 @@ def test_inequalities_of_a_constellation(name, options, applying, capsys):
 
 
 @pytest.mark.process
+@pytest.mark.parametrize(("count", "agents"), [(1, "1 agent"), (3, "3 agents")])
+def test_what_a_batch_takes_is_told_with_the_agents_that_it_was_timed_with(count, agents, capsys):
+    with pytest.raises(SystemExit):
+        main(["plan", str(SCENARIOS / "iridium10.yaml"), "--set", f"agents.count={count}"])
+
+    assert f"measured here, T_p(S_b) with {agents} at once" in capsys.readouterr().out
+
+
+@pytest.mark.process
 def test_json_tells_the_demand_as_well(capsys):
     _, told = plan(capsys, "thesis/table_2_2_corrected.yaml")
 

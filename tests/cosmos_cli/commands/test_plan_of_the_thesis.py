@@ -7,6 +7,7 @@ import pytest
 
 from cosmos_cli.app import main
 from cosmos_cli.launch.feasibility import judge
+from cosmos_cli.launch.plan import make_plan
 from cosmos_cli.launch.plan_view import demand_of, resources_of
 from cosmos_cli.models.loading import load_scenario
 
@@ -17,9 +18,8 @@ PRINTED, CORRECTED = "thesis/table_2_2.yaml", "thesis/table_2_2_corrected.yaml"
 def inequalities(name, *overrides, latency_s=0.001):
     file = load_scenario(SCENARIOS / name, overrides)
     agents = file.scenario.agents
-    found = judge(
-        demand_of(file), resources_of(file, latency_s), agents=agents.count, tick_hz=agents.tick_hz
-    )
+    resources = resources_of(file, make_plan(file.scenario), latency_s)
+    found = judge(demand_of(file), resources, agents=agents.count, tick_hz=agents.tick_hz)
     return {item.number: item for item in found.inequalities}
 
 
@@ -63,6 +63,27 @@ def test_1000_agents_with_45_s_and_five_workers():
     assert found["2.7"].breaks_at == 1250
 
 
+def test_agents_whose_workers_cannot_follow_are_not_said_to_keep_real_time(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["plan", str(SCENARIOS / CORRECTED), "--set", "agents.count=70"])
+
+    # A batch of 0.04 s in 10 s and a maneuver of 0.04 s each second: 22 agents take 0.968 of the one worker.
+    *_, last = capsys.readouterr().out.splitlines()
+    assert ended.value.code == 0
+    assert last.startswith(
+        "70 agents may not keep real time: the inequalities hold, but up to 22 are predicted, by host's workers"
+    )
+
+
+@pytest.mark.parametrize(("buffer_bytes", "is_warned"), [(48, True), (4799, True), (4800, False)])
+def test_a_buffer_that_holds_no_batch_is_warned_of(buffer_bytes, is_warned, capsys):
+    with pytest.raises(SystemExit):
+        main(["plan", str(SCENARIOS / CORRECTED), "--set", f"plan.buffer_bytes={buffer_bytes}"])
+
+    err = capsys.readouterr().err
+    assert ("does not hold a batch of 4,800 B (S_b)" in err) == is_warned
+
+
 @pytest.mark.process
 def test_1000_satellites_of_starlink_keep_real_time(capsys):
     with pytest.raises(SystemExit) as ended:
@@ -74,4 +95,4 @@ def test_1000_satellites_of_starlink_keep_real_time(capsys):
     assert told["resources"]["workers"] == 5
     assert told["feasibility"]["inequalities"][2]["left"] == 45.0
     names = {each["name"] for each in told["capacity"]["limits"]}
-    assert {"host's loop", "process of agents", "inequality 2.8"} <= names
+    assert {"host's loop", "host's workers", "process of agents", "inequality 2.8"} <= names

@@ -316,6 +316,16 @@ def test_plan_of_more_agents_than_it_predicts_does_not_say_that_they_keep_real_t
     )
 
 
+def test_plan_of_a_flow_that_never_sends_again_as_json(cosmos):
+    # The time to the next message of so low a rate is infinite as a number.
+    flow = "plan.flows=[{name: rare, message_bytes: 8, rate_hz: 1.0e-320}]"
+
+    code, out, err = cosmos("plan", "a.yaml", "--set", flow, "--json")
+
+    assert (code, err) == (ExitCode.OK, "")
+    assert json.loads(out)["demand"]["flows"][0]["within_s"] is None
+
+
 def test_plan_names_several_broken_inequalities_in_the_plural():
     demand = Demand(
         flows=(),

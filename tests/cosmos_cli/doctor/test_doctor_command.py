@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from cosmos_cli.app import run as cosmos
+from cosmos_cli.commands import doctor as command
 from cosmos_cli.commands.doctor import with_machines
 from cosmos_cli.doctor.finding import HERE, CheckRemark, Finding
 from cosmos_cli.fleet.connection import Connection, ConnectOptions
@@ -83,8 +84,6 @@ def inventory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def told(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Let machines tell something else, so that nothing depends on this computer's state."""
-    import cosmos_cli.commands.doctor as command
-
     ask, ask_here = command.ask, command.ask_here
     other: dict[str, dict[str, Any]] = {}
 
@@ -200,6 +199,88 @@ def test_wants_are_the_scenarios(
     assert answer["scenario"] == "two"
     assert any(f["check"] == "feasibility" and f["level"] == "ok" for f in here["findings"])
     assert any("2 agents at 20 Hz" in f["found"] for f in machine["findings"])
+
+
+@pytest.fixture
+def quick_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A counter on this computer that keeps 2000 Hz by a datagram's time on loopback, and would not by a switch's."""
+    monkeypatch.setattr("cosmos_cli.launch.plan_view.measure_loopback_s", lambda: 1e-5)
+    path = tmp_path / "quick.yaml"
+    path.write_text("name: quick\nsimulation: counter\nagents: {count: 3, tick_hz: 2000}\n")
+    return str(path)
+
+
+def findings_of(check: str, answer: dict[str, Any]) -> list[dict[str, Any]]:
+    return [each for each in answer["machines"][0]["findings"] if each["check"] == check]
+
+
+def test_inequalities_of_a_run_on_this_computer_are_those_of_its_plan(
+    told: Callable[..., None], quick_scenario: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan_code = cosmos(["plan", quick_scenario, "--json"])
+    planned = json.loads(capsys.readouterr().out)["feasibility"]
+    code = cosmos(["doctor", quick_scenario, "--json"])
+    answer = json.loads(capsys.readouterr().out)
+
+    assert (plan_code, code) == (0, 0)
+    assert answer["machines"][0]["probed"]["here"]["feasibility"] == planned
+    assert [each["level"] for each in findings_of("feasibility", answer)] == ["ok"]
+
+
+def test_lockstep_is_not_held_against_real_time(
+    told: Callable[..., None], quick_scenario: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = ["--set", "plan.latency_ms=5", "--json"]
+
+    real_time = cosmos(["doctor", quick_scenario, *broken])
+    capsys.readouterr()
+    lockstep = cosmos(["doctor", quick_scenario, *broken, "--set", "time.mode=lockstep"])
+    answer = json.loads(capsys.readouterr().out)
+
+    assert (real_time, lockstep) == (1, 0)
+    assert findings_of("feasibility", answer) == []
+
+
+@pytest.mark.parametrize(
+    ("agents", "level"),
+    [
+        ("{count: 62, tick_hz: 100}", "ok"),
+        ("{count: 80, tick_hz: 100}", "warning"),  # up to 62 by the plan; 54 and 66 were found
+        ("{count: 93, tick_hz: 100, per_process: 47}", "ok"),  # as measured, with none missed
+        ("{count: 93, tick_hz: 100, per_process: 93}", "ok"),
+        ("{count: 93, tick_hz: 200, per_process: 93}", "warning"),  # one thread
+    ],
+)
+def test_agents_are_held_against_the_processors_as_a_plan_does(
+    told: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    agents: str,
+    level: str,
+) -> None:
+    ask_here = command.ask_here
+
+    def on_two(*arguments: Any, **options: Any) -> dict[str, Any]:
+        values = ask_here(*arguments, **options)
+        values["limits"]["usable_processors"] = 2
+        return values
+
+    monkeypatch.setattr(command, "ask_here", on_two)
+    monkeypatch.setattr("cosmos_cli.launch.capacity_view.processors_here", lambda: 2)
+    path = tmp_path / "many.yaml"
+    path.write_text(f"name: many\nsimulation: counter\nagents: {agents}\n")
+
+    cosmos(["plan", str(path), "--latency-ms", "0.01", "--json"])
+    capacity = json.loads(capsys.readouterr().out)["capacity"]
+    cosmos(["doctor", str(path), "--json"])
+    (finding,) = findings_of("processors", json.loads(capsys.readouterr().out))
+
+    most = {each["name"]: each["agents"] for each in capacity["limits"]}
+    count = int(agents.partition(",")[0].removeprefix("{count: "))
+    names = ("process of agents", "processors of this computer")
+    is_planned = all(most[name] is None or count <= most[name] for name in names)
+    assert (finding["level"], is_planned) == (level, level == "ok")
 
 
 def test_processors_that_a_machine_has_not_are_told_whoever_asks_for_them(

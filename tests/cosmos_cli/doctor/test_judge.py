@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from cosmos_cli.doctor.case import Case, Wants
+from cosmos_cli.doctor.case import AgentBound, Case, Wants
 from cosmos_cli.doctor.finding import HERE, Finding, Severity
 from cosmos_cli.doctor.judge import CHECKS, judge
 from cosmos_cli.models.scenario import Scenario
@@ -39,7 +39,12 @@ def judged(case: dict[str, Any]) -> list[Finding]:
     is_here = bool(case.get("here"))
     told = told_with(case.get("change", {}), is_here=is_here)
     machine = HERE if is_here else "pi04"
-    return judge(Case.of(machine, told, Wants(**case.get("wants", {}))))
+    wants = dict(case.get("wants", {}))
+    bounds = {
+        name: AgentBound(agents=agents, is_of_process=is_of_process)
+        for name, (agents, is_of_process) in wants.pop("bounds", {}).items()
+    }
+    return judge(Case.of(machine, told, Wants(**wants, bounds=bounds)))
 
 
 def named(case: dict[str, Any]) -> str:

@@ -17,6 +17,7 @@ from cosmos_cli.evidence.devices import (
     read_devices,
     refusal_remarks,
     silent_input_remarks,
+    spoiled_data_remarks,
     stale_sample_remarks,
 )
 from cosmos_cli.evidence.run_directory import RunDirectory
@@ -266,6 +267,22 @@ def test_what_devices_refused_is_told_by_device_and_bounded() -> None:
     assert first == "device pi1/a: 1 time something was refused; its events.jsonl says what and why"
     assert last == "4 more devices that refused something"
     assert refusal_remarks({"pi1/a": {"counts": {}}, "pi2/a": {}}) == ()
+
+
+def test_what_is_lost_spoiled_or_beyond_its_limits_is_told_by_device_and_bounded() -> None:
+    bad = {"garbage_bytes": 17353, "received_bytes": 18703, "bad_checksums": 67, "samples": 23}
+    line = {"garbage_bytes": 40, "received_bytes": 4000, "bad_checksums": 0}  # opened in mid-frame
+    imu = {"rate_beyond_limits": 77}
+
+    told = {name: {"counts": c} for name, c in {"pi/a": bad, "pi/b": line, "pi/c": imu}.items()}
+    told["pi/d"] = {}
+
+    assert spoiled_data_remarks(told) == (
+        "device pi/a: lost, spoiled or beyond limits: bad_checksums 67, garbage_bytes 17353 of 18703",
+        "device pi/c: lost, spoiled or beyond limits: rate_beyond_limits 77",
+    )
+    *_, last = spoiled_data_remarks({f"pi/{n}": {"counts": imu} for n in range(25)})
+    assert last == "5 more devices with something lost, spoiled or beyond limits"
 
 
 def test_remarks_on_losses_are_bounded() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from cosmos_cli.evidence.expectations import accumulators, held_times, records
 from cosmos_cli.evidence.expectations.judge import judge_expectations
-from cosmos_cli.evidence.verdict import conclusion_of_expectations
+from cosmos_cli.evidence.verdict import CheckResult, conclusion_of_expectations
 from cosmos_cli.models.expectation import Expectation, HeldBounds
 from madns_runtime.conditions.condition import ValueBounds
 from madns_runtime.recording.records import Field
@@ -739,12 +739,68 @@ def test_a_stream_of_the_other_time_mode_is_not_judged_and_a_run_without_any_jud
             " and this run was in lockstep",
         ),
     )
-    assert conclusion_of_expectations((), lockstep.gaps())[0] == 5
+    assert conclusion_of_expectations((), lockstep.gaps(), {})[0] == 5
     assert judge(of_ticks, is_lockstep=False).results[0].passed is False
     both = judge(of_ticks, expect(bounds=ValueBounds.below(1e9)))
     assert [each.name for each in both.results] == ["x"]
     assert both.gaps() == ()
     assert both.remarks()[0].startswith("ticks: not judged: ")
+
+
+@pytest.mark.parametrize("run_code", [1, 3, 130])
+@pytest.mark.parametrize(
+    ("missing", "passed", "told"),
+    [
+        ((), True, "1 check holds"),
+        ((), False, "CHECK BROKEN: x 1 (limit 2)"),
+        (("host: no result",), True, "DATA INCOMPLETE: host: no result"),
+    ],
+)
+def test_a_run_that_went_wrong_is_no_pass_whatever_holds_of_its_records(
+    run_code, missing, passed, told
+):
+    result = CheckResult(name="x", limit=2.0, got=1.0, passed=passed)
+    document = {"exit_code": run_code, "verdict": "FAILED: host: boom"}
+
+    code, text = conclusion_of_expectations([result], missing, document)
+
+    assert code == run_code
+    assert text == f"FAILED: host: boom; judged by what it recorded: {told}"
+
+
+@pytest.mark.parametrize("run_code", [0, 4, 5])
+def test_a_run_that_ended_as_it_should_is_judged_by_the_expectations_alone(run_code):
+    held = CheckResult(name="x", limit=2.0, got=1.0, passed=True)
+    document = {"exit_code": run_code, "verdict": "CHECK BROKEN: another"}
+
+    assert conclusion_of_expectations([held], (), document) == (0, "PASSED: 1 check holds")
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"stream": "events", "field": "event", "event": "burn", "must": "not_occur"},
+        {"statistic": "count", "bounds": ValueBounds.below(5.0)},
+        {"statistic": "rate", "bounds": ValueBounds.below(5.0)},
+    ],
+)
+@pytest.mark.parametrize("from_s", [DURATION_S, 2 * DURATION_S])
+def test_no_record_is_no_answer_for_a_time_that_was_never_flown(asked, from_s):
+    (result,) = judge(expect(from_s=from_s, to_s=3 * DURATION_S, **asked)).results
+
+    assert (result.got, result.passed) == (None, False)
+    assert result.expected == f"x (the run ended at {DURATION_S:g} s, before its from_s)"
+
+
+def test_a_time_that_was_flown_in_part_is_judged_with_a_remark():
+    few = {"statistic": "count", "bounds": ValueBounds.below(1e9), "from_s": 20.0}
+
+    over = judge(expect(**few, to_s=2 * DURATION_S))
+    whole = judge(expect(**few, to_s=DURATION_S))
+
+    assert over.results[0].passed and whole.results[0].passed
+    assert over.remarks() == ("x: judged until 100 s, when the run ended, and not until 200 s",)
+    assert whole.remarks() == ()
 
 
 def test_what_comes_after_a_check_that_is_not_judged_is_not_judged_either():

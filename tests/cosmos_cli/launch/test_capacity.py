@@ -69,6 +69,20 @@ def test_the_limits_of_the_inequalities_are_the_agents_that_still_fit():
     assert limit(found, "inequality 2.9") == math.inf
 
 
+def test_workers_have_batches_and_every_maneuver_to_compute():
+    asked = dataclasses.replace(
+        NOTHING, batch_compute_s=0.04, buffer_s=10.0, sync_compute_s=0.04, sync_rate_hz=1.0, lead_s=3.0
+    )  # fmt: skip
+    idle = dataclasses.replace(asked, sync_rate_hz=0.0)
+
+    assert limit(predicted(demand=asked), "host's workers") == 22  # 0.044 of a worker each
+    assert limit(predicted(demand=asked, workers=2), "host's workers") == 45
+    assert limit(predicted(demand=idle), "host's workers") == 250
+    assert limit(predicted(), "host's workers") == math.inf
+    # The host's computer has ticks of 100 Hz besides: 25 ms of 1.6 s each.
+    assert limit(predicted(demand=asked), "processors of here") == 1.6 // (0.025 + 0.044)
+
+
 def test_a_burst_must_fit_the_granted_buffer():
     # Linux' default of 208 KiB holds 277 small datagrams and 92 of 1400 bytes.
     assert limit(predicted(buffer=212_992), "receive buffer of the host") == 277

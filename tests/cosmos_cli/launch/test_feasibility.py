@@ -130,6 +130,22 @@ def test_workers_take_maneuvers_in_rounds():
     assert item.breaks_at == 149
 
 
+def test_measured_work_runs_on_no_more_workers_than_there_are_processors():
+    offered = resources(workers=64, processors=2)
+
+    measured = judge(demand(measured=True), offered, agents=75, tick_hz=10.0)
+    declared = judge(demand(measured=False), offered, agents=75, tick_hz=10.0)
+
+    assert (measured.workers, declared.workers) == (2, 64)
+    assert [item.left for item in measured.inequalities[:2]] == [
+        pytest.approx(75 * 0.04 / 2 + 0.001),
+        pytest.approx(38 * 0.04 + 0.002),
+    ]
+    assert measured.inequalities[1].breaks_at == 149
+    assert declared.inequalities[1].left == pytest.approx(2 * 0.04 + 0.002)
+    assert measured.to_mapping()["workers"] == 2
+
+
 def test_binding_is_the_one_that_breaks_at_the_fewest_agents():
     assert judge(demand(), resources(), agents=10, tick_hz=10.0).binding.number == "2.8"
 
@@ -196,11 +212,19 @@ def test_latency_beyond_the_buffer_breaks_at_the_first_agent():
 
 def test_wire_bytes_add_headers_for_every_datagram():
     assert [wire_bytes(size) for size in (0, 1, FRAGMENT_BYTES_MAX, FRAGMENT_BYTES_MAX + 1)] == [
-        0,
+        HEADERS,
         1 + HEADERS,
         1400 + 28,
         FRAGMENT_BYTES_MAX + 1 + 2 * HEADERS,
     ]
+
+
+def test_empty_messages_have_headers_to_carry():
+    empty = (Flow(name="empty", message_bytes=0, rate_hz=10_000),)
+
+    item = inequality("2.10", agents=3, asked=demand(**WITHOUT, flows=empty))
+
+    assert item.left == pytest.approx(3 * 10_000 * HEADERS)
 
 
 def test_infinity_becomes_null():

@@ -77,6 +77,15 @@ def test_broken_inequality_is_a_warning_as_a_run_starts_nevertheless(place, caps
     assert last.startswith("READY: 4000 agents on this computer, but it cannot keep real time")
 
 
+def test_more_agents_than_are_predicted_are_not_said_to_keep_real_time(place, capsys):
+    quick = ("--set", "agents.tick_hz=10000", "--set", "plan.latency_ms=0.001")
+
+    assert cosmos(["run", "s.yaml", "--check", *quick]) == 0
+
+    told = capsys.readouterr().out
+    assert "3 agents may not keep real time: the inequalities hold, but up to 0 are" in told
+
+
 @pytest.mark.process
 def test_simulation_that_cannot_say_what_it_asks_for_is_a_warning(place, capsys):
     plugin = """

@@ -105,9 +105,54 @@ checks:
 """
 
 
+PLUGIN = """
+from dataclasses import dataclass
+from madns_runtime.plugin.api import AgentSimulation, HostSimulation, Simulation
+
+@dataclass(frozen=True)
+class Parameters:
+    pass
+
+class H(HostSimulation):
+    def initial_data(self, agent):
+        return {}
+
+class A(AgentSimulation):
+    def step(self, tick):
+        self.index = tick.index
+
+simulation = Simulation(name="calm", parameters=Parameters, host=":H", agent=":A")
+"""
+OF_PLUGIN = """
+name: calm
+simulation: ./calm.py:simulation
+agents: {count: 1, tick_hz: 10}
+time: {duration_s: 0.5, mode: lockstep}
+"""
+
+
 def rerun(cosmos, *arguments):
     done = cosmos("rerun", *arguments, "--json", "--quiet")
     return done.returncode, json.loads(done.stdout) if done.stdout else {}, done.stderr
+
+
+def test_a_run_that_fails_where_it_was_to_be_compared_is_told_with_its_verdict_and_folder(tmp_path):
+    plugin, scenario = tmp_path / "calm.py", tmp_path / "calm.yaml"
+    plugin.write_text(PLUGIN)
+    scenario.write_text(OF_PLUGIN)
+    cosmos = CosmosCommand(tmp_path)
+    code, document = cosmos.run(scenario)
+    assert code == 0, document["verdict"]
+    plugin.write_text(PLUGIN.replace("self.index = tick.index", "raise RuntimeError('boom')"))
+
+    compared = cosmos("diff", "--run", scenario, scenario, "--json", "--quiet")
+    again = cosmos("rerun", document["run"], "--json", "--quiet")
+
+    for done in (compared, again):
+        told = json.loads(done.stdout)
+        assert (done.returncode, told["exit_code"], told["error"]["kind"]) == (1, 1, "run_failed")
+        assert "boom" in told["error"]["message"] and "boom" in done.stderr
+        assert (Path(told["error"]["run"]) / "run.json").is_file()
 
 
 @pytest.fixture(scope="module")

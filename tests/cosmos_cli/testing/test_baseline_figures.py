@@ -1,6 +1,7 @@
 """Figures of a run by the names of a baseline, and the baseline that is written anew."""
 
 import math
+from typing import get_args
 
 import pytest
 import yaml
@@ -8,9 +9,10 @@ from harness.synthetic_run import SyntheticRun
 
 from cosmos_cli.errors import InputError
 from cosmos_cli.evidence.tabulate import gather
-from cosmos_cli.models.baseline import read_baseline
+from cosmos_cli.models.baseline import Statistic, read_baseline
 from cosmos_cli.testing.baseline_update import update_baseline
 from cosmos_cli.testing.figures import ComparedFigure, compare_figures
+from madns_runtime.plain_values import is_real
 from madns_runtime.recording.records import Field, StreamSchema
 
 BASELINE = """\
@@ -55,6 +57,14 @@ def test_figures_of_run_json_and_of_streams_are_compared_within_their_tolerance(
         ["ticks", "first check", "status", "trips", "mean trip", "one trip", "last packet"], True
     )
     assert {each.name: each.allowed for each in compared}["mean trip"] == pytest.approx(68)
+
+
+@pytest.mark.parametrize("statistic", get_args(Statistic))
+def test_every_statistic_gives_a_number(baseline, run, statistic):
+    figure = f"{{stream: round_trips, field: round_trip_us, statistic: {statistic}}}"
+    (compared,) = compare_figures(baseline(f"figures: {{a: {figure}}}"), run, DOCUMENT)
+
+    assert is_real(compared.got)
 
 
 @pytest.mark.parametrize(

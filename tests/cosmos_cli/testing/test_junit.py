@@ -126,20 +126,35 @@ def test_an_earlier_file_is_gone_before_what_it_would_be_taken_for(tmp_path, cap
     earlier = tmp_path / "j.xml"
     missing = tmp_path / "missing.yaml"
 
-    for command in ("run", "test"):
+    for command in (["run"], ["test"], ["run", "-i", str(tmp_path / "missing.ini")]):
         earlier.write_text("<testsuites/>")
-        assert run([command, str(missing), "--junit", str(earlier)]) == ExitCode.BAD_INPUT
-        assert "missing.yaml" in capsys.readouterr().err
+        assert run([*command, str(missing), "--junit", str(earlier)]) == ExitCode.BAD_INPUT
+        assert "missing." in capsys.readouterr().err
         assert not earlier.exists()
 
 
-def test_a_scenario_that_is_taken_for_the_file_is_kept(tmp_path, capsys):
-    scenario = tmp_path / "a.yaml"
-    scenario.write_text("name: a\nsimulation: counter\n")
+@pytest.mark.parametrize(
+    "text",
+    [
+        "name: a\nsimulation: counter\n",
+        "# of <testsuites/>\nname: a\n",
+        "<?xml version='1.0'?>\n<SpaceSystem/>\n",
+    ],
+)
+def test_another_file_that_is_taken_for_it_is_kept(tmp_path, capsys, text):
+    other = tmp_path / "a.yaml"
+    other.write_text(text)
 
-    assert run(["test", "--junit", str(scenario)]) == ExitCode.BAD_INPUT
-    assert "a.yaml: cannot be written: what is there is no XML" in capsys.readouterr().err
-    assert scenario.read_text().startswith("name: a")
+    assert run(["test", "--junit", str(other)]) == ExitCode.BAD_INPUT
+    assert "a.yaml: cannot be written: what is there is no JUnit XML" in capsys.readouterr().err
+    assert other.read_text() == text
+
+
+def test_an_empty_file_and_one_of_anybody_elses_tests_is_replaced(tmp_path):
+    theirs = tmp_path / "theirs.xml"
+    theirs.write_text('\ufeff<?xml version="1.0"?>\n<testsuite name="pytest"/>', "utf-8")
+    prepare_junit(theirs)
+    assert not theirs.exists()
 
     (tmp_path / "empty.xml").touch()
     prepare_junit(tmp_path / "empty.xml")

@@ -31,8 +31,8 @@ from madns_runtime.simulations.constellation.orbit.constants import EGM_96, GRAV
 from madns_runtime.simulations.constellation.orbit.mean_elements import mean_from_state
 from madns_runtime.simulations.constellation.orbit.visibility import have_line_of_sight
 from madns_runtime.simulations.constellation.parameters import Crosslinks
+from madns_runtime.simulations.constellation.vehicles import EVEN_SLOTS, SLOTS
 
-SLOTS = ("even", "kept")
 MEANING = ("slots", "spacing_deg", "plane_deg", "sma_km")
 """Settings that say what a slot is."""
 TIMES_MAX = 97
@@ -96,7 +96,7 @@ def read_control(
     keepers = mean.copy()
     if believed is not None:
         keepers[np.isnan(believed).all(axis=1)] = np.nan
-    if slots == "even":
+    if slots == EVEN_SLOTS:
         errors = even_errors_deg(keepers, spacing_deg=_number(settings.get("spacing_deg")))
     else:
         heard = _who_hears_whom(state, agents, times_s[:1], config)
@@ -258,7 +258,7 @@ def _mean_elements(
             try:
                 mean = mean_from_state((x, y, z), (vx, vy, vz), model)
             except ValueError:
-                continue  # no ellipse: it has no place in a ring
+                continue  # no ellipse, or in the equator: it has no place in a ring
             sine = math.sin(mean.i_rad)
             normal = (sine * math.sin(mean.raan_rad), -sine * math.cos(mean.raan_rad))
             found[row, place] = (mean.lam_rad, mean.a_m, *normal, math.cos(mean.i_rad))

@@ -84,7 +84,7 @@ class SlotErrors:
                     (x, y, z), (vx, vy, vz), self._gravity
                 ).lam_rad
             except ValueError:
-                continue  # no ellipse: it has no place in a ring
+                continue  # no ellipse, or in the equator: it has no place in a ring
         errors_deg = even_errors_deg(mean, spacing_deg=self._spacing_deg)[:, 0]
         counted = np.flatnonzero(np.isfinite(errors_deg))
         agents, found = self._context.agents, errors_deg[counted]

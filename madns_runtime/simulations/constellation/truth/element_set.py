@@ -52,6 +52,11 @@ class ElementSet:
         return text.strip().lstrip("0")
 
     @property
+    def inclination_deg(self) -> float:
+        """Of the mean orbit, deg."""
+        return float(self.lines[1][8:16] if self.lines else dict(self.omm)["INCLINATION"])
+
+    @property
     def perigee_km(self) -> float:
         """Height of the mean orbit's perigee above the equator's radius."""
         if self.lines:

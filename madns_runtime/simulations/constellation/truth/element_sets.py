@@ -8,6 +8,7 @@ a set is propagated (`sgp4_propagator`). Every fault of a file is reported at on
 from __future__ import annotations
 
 import functools
+import re
 from pathlib import Path
 
 from madns_runtime.bounded_files import FileRefused, read_regular_file
@@ -22,6 +23,8 @@ FAULTS_MAX = 20
 """Faults that one message lists; a file of another kind would give one per line."""
 READERS = {"csv": read_csv, "json": read_json, "xml": read_xml, "tle": read_tle}
 """By kind of file."""
+_KVN = re.compile(r"\s*CCSDS_OMM_VERS\s*=")
+"""How an OMM as KVN begins."""
 
 
 def read_element_sets(path: Path) -> tuple[ElementSet, ...]:
@@ -60,6 +63,17 @@ def _read_text(path: Path) -> str:
 
 
 def _kind(path: Path, text: str) -> str:
+    """
+    Return the kind of a file, a key of READERS.
+
+    Raises:
+        ConfigurationError: It is an OMM as KVN.
+    """
+    if _KVN.match(text):
+        raise ConfigurationError(
+            f"{path}: expected TLE, or OMM as CSV, JSON or XML, got OMM as KVN (KEYWORD = value), which is not read; "
+            "take the same sets in one of those forms"
+        )
     suffix = path.suffix.lower()
     if suffix in (".csv", ".json", ".xml", ".tle"):
         return suffix[1:]
@@ -68,4 +82,4 @@ def _kind(path: Path, text: str) -> str:
         return "json"
     if head == "<":
         return "xml"
-    return "csv" if "MEAN_MOTION" in text.partition("\n")[0] else "tle"
+    return "csv" if "MEAN_MOTION" in text.lstrip().partition("\n")[0] else "tle"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime, timedelta
 
 from madns_runtime.plain_values import shown
 from madns_runtime.simulations.constellation.truth.element_set import (
@@ -40,32 +41,37 @@ FIXED_FIELDS = {
 
 OTHER_WORDS = {("MEAN_ELEMENT_THEORY", "SGP/SGP4"): "SGP4"}
 """Other words for them. Source: CCSDS 502.0-B-3, whose own examples write the theory so."""
+_DATE = re.compile(r"([0-9]{4})-([0-9]{3}|[0-9]{2}-[0-9]{2})([T ].*)?", re.ASCII)
+"""By month and day or by day of the year. Source: CCSDS 502.0-B-3, 7.5.10; ISO 8601 alone has weeks, too, others a blank for T."""
 
 
 def read_csv(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]:
     """Yield the sets of an OMM as CSV, one per row; what is wrong goes into *faults*."""
-    reader = csv.DictReader(io.StringIO(text))
+    rows = text.lstrip()
+    above = text[: len(text) - len(rows)].count("\n")
+    reader = csv.DictReader(io.StringIO(rows), skipinitialspace=True)
     try:
         missing = sorted({"EPOCH", *NUMBERS} - set(reader.fieldnames or ()))
         if missing:
             columns = ", ".join(missing)
-            faults.append(f"{where}:1: expected the columns of an OMM, missing {columns}")
+            faults.append(f"{where}:{above + 1}: expected the columns of an OMM, missing {columns}")
             return
         twice = sorted(_twice(reader.fieldnames or ()))
         if twice:
             faults.append(
-                f"{where}:1: expected every column once, got {', '.join(twice)[:200]} again"
+                f"{where}:{above + 1}: expected every column once, got {', '.join(twice)[:200]} again"
             )
             return
         for row in reader:
+            at = f"{where}:{above + reader.line_num}"
             if None in row:  # what has no column
                 width = len(reader.fieldnames or ())
-                faults.append(f"{where}:{reader.line_num}: expected {width} values, got more")
+                faults.append(f"{at}: expected {width} values, got more")
                 continue
             fields = {key: value for key, value in row.items() if key and value is not None}
-            yield from _omm_set(fields, f"{where}:{reader.line_num}", faults)
+            yield from _omm_set(fields, at, faults)
     except csv.Error as error:
-        faults.append(f"{where}:{reader.line_num}: {error}")
+        faults.append(f"{where}:{above + reader.line_num}: {error}")
 
 
 def read_json(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]:
@@ -118,8 +124,10 @@ def read_xml(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]:
         line, column = error.position
         faults.append(f"{where}:{line}:{column + 1}: {error.msg}")
         return
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]  # without its namespace
     segments = list(root.iter("segment"))
-    lines = _lines_of("<segment", text)
+    lines = _lines_of(r"<([\w.-]+:)?segment\b", text)
     for index, segment in enumerate(segments):
         line = lines[index] if len(lines) == len(segments) else 1
         leaves = [leaf for leaf in segment.iter() if len(leaf) == 0]
@@ -131,9 +139,9 @@ def read_xml(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]:
         yield from _omm_set(fields, f"{where}:{line}", faults)
 
 
-def _lines_of(needle: str, text: str) -> list[int]:
-    """Return the numbers of the lines that hold *needle*: where each set of a document stands."""
-    return [n for n, line in enumerate(text.splitlines(), start=1) if needle in line]
+def _lines_of(pattern: str, text: str) -> list[int]:
+    """Return the numbers of the lines that hold a pattern: where each set of a document stands."""
+    return [n for n, line in enumerate(text.splitlines(), start=1) if re.search(pattern, line)]
 
 
 def _omm_set(fields: dict[str, str], at: str, faults: list[str]) -> Iterator[ElementSet]:
@@ -151,8 +159,8 @@ def _omm_set(fields: dict[str, str], at: str, faults: list[str]) -> Iterator[Ele
     epoch = _omm_epoch(fields.get("EPOCH", ""))
     if epoch is None:
         faults.append(
-            f"{at}: EPOCH: expected such as 2017-03-07T07:18:55.000000, of a year from {FIRST_YEAR} to {LAST_YEAR - 1}, "
-            f"got {shown(fields.get('EPOCH'))}"
+            f"{at}: EPOCH: expected such as 2017-03-07T07:18:55.000000 or 2017-066T07:18:55, "
+            f"of a year from {FIRST_YEAR} to {LAST_YEAR - 1}, got {shown(fields.get('EPOCH'))}"
         )
     if len(faults) > before or epoch is None:
         return
@@ -164,9 +172,19 @@ def _omm_set(fields: dict[str, str], at: str, faults: list[str]) -> Iterator[Ele
 
 
 def _omm_epoch(text: str) -> datetime | None:
+    """Return an epoch of CCSDS ASCII time code A or B; None if it is none, has a zone or an impossible year."""
+    form = _DATE.fullmatch(text.strip().removesuffix("Z"))
+    if form is None:
+        return None
+    year, day, time = form.groups(default="")
     try:
-        epoch = datetime.fromisoformat(text.strip().removesuffix("Z"))
-    except ValueError:
+        if len(day) == 3:
+            of_year = date(int(year), 1, 1) + timedelta(days=int(day) - 1)
+            if of_year.year != int(year):
+                return None
+            day = f"{of_year:%m-%d}"
+        epoch = datetime.fromisoformat(f"{year}-{day}{time}")
+    except (ValueError, OverflowError):  # no such date or time; before or behind all years
         return None
     if epoch.tzinfo is not None or not FIRST_YEAR <= epoch.year < LAST_YEAR:
         return None

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import lru_cache
-from typing import Protocol, get_args, get_type_hints
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +30,9 @@ from madns_runtime.simulations.constellation.orbit.constants import (
     GravityModel,
 )
 from madns_runtime.simulations.constellation.orbit.invariants import invariants
-from madns_runtime.simulations.constellation.parameters import AnyPropagator
+from madns_runtime.simulations.constellation.parameters import PROPAGATORS, AnyPropagator
 from madns_runtime.simulations.constellation.truth.element_set import ElementSet
 
-PROPAGATORS: dict[str, type[AnyPropagator]] = {
-    get_args(get_type_hints(settings)["kind"])[0]: settings for settings in get_args(AnyPropagator)
-}
-"""The kind in a scenario -> its settings."""
 FAULTS_MAX = 5
 """Vehicles that one message names."""
 _ANY_ORBIT = (7.0e6, 0.0, 0.0, 0.0, 7.5e3, 0.0)
@@ -194,9 +190,10 @@ def propagate(
     shape = (len(states), len(knots_s), 6)
     if 0 in shape:
         return np.empty(shape)
-    is_down = is_inside_earth(states)
-    # Something flies in the place of a wreck, whose own way would lead to the Earth's centre.
-    flown = np.where(is_down[:, None], _ANY_ORBIT, states) if is_down.any() else states
+    is_down, flown = is_inside_earth(states), states
+    if is_down.any() and not parameters.settings.PROPERTIES.needs_element_sets:
+        # Something flies in the place of a wreck, whose own way would lead to the Earth's centre.
+        flown = np.where(is_down[:, None], _ANY_ORBIT, states)
     found = load_propagator(parameters.settings.kind).propagate(flown, t0_s, knots_s, parameters)
     _check_result(found, shape, knots_s, parameters)
     inside = is_inside_earth(found)

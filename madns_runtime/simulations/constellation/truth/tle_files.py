@@ -25,24 +25,31 @@ _TLE_LINE_2 = re.compile(
 
 
 def read_tle(text: str, where: str, faults: list[str]) -> Iterator[ElementSet]:
-    """Yield the sets of a file of TLEs; what is wrong goes into *faults*."""
-    name = ""
+    """
+    Yield the sets of a file of TLEs; what is wrong goes into *faults*.
+
+    Lines that begin with # are comments, except one such as "#1 SAT" directly above a line 1 without a name: it is the name.
+    """
+    name = marked = ""
     first: tuple[int, str] | None = None
     number = 0
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.rstrip()
         if not line or line.startswith("#"):
+            marked = line
             continue
         if first is not None:
             found = _tle_set(name, first, (number, line), where, faults)
             if found is not None:
                 yield found
-            first, name = None, ""
+            first, name, marked = None, "", ""
         elif line.startswith("1 ") and len(line) > TLE_NAME_COLUMNS:
             first = (number, line)
+            if marked[1:2].isdigit() and len(marked) <= TLE_NAME_COLUMNS:
+                name = name or marked
         elif name or len(line.removeprefix("0 ")) > TLE_NAME_COLUMNS:
             faults.append(f"{where}:{number}: expected line 1 of a TLE, got {line[:24]!r}")
-            name = ""
+            name = marked = ""
         else:
             name = line.removeprefix("0 ").strip()
     if first is not None or name:

@@ -21,6 +21,7 @@ from madns_runtime.errors import BlamedError
 from madns_runtime.plugin.context import clean_text
 from madns_runtime.reactor import libc
 from madns_runtime.reactor.scheduling import die_with_parent
+from madns_runtime.signal_names import signal_name
 from madns_runtime.simulations.constellation.flight.programs import find_program
 from madns_runtime.timing.granted_clock import GrantedClock
 
@@ -133,7 +134,7 @@ class FlightProgram:
         code = self._process.returncode
         if code is None:
             return f"closed {'its standard output' if self.pipes else 'the way to the vehicle'}"
-        return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        return f"was killed by {signal_name(-code)}" if code < 0 else f"ended with exit code {code}"
 
     def end(
         self,

@@ -23,20 +23,23 @@ from madns_runtime.simulations.constellation.equipment import (
 )
 from madns_runtime.simulations.constellation.messages import Command
 from madns_runtime.simulations.constellation.thrust import Vector
-from madns_runtime.simulations.constellation.truth.maneuvers.effects import scaled
+from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
+    ARC_S_MIN,
+    scaled,
+)
+from madns_runtime.simulations.constellation.truth.maneuvers.tank import (
+    ROUNDING_SHARE,
+    Tank,
+)
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 """By definition; specific impulse in seconds is exhaust velocity over it."""
 DELTA_V_M_S_MIN = 1e-12
 """Less does not show in the last digit of an orbit's velocity."""
-ROUNDING_SHARE = 1e-12
-"""Of a vehicle's mass: so much more than what is left may be asked for by whoever means all of it; 2e-9 m/s."""
 TORQUE_N_M_MIN = 1e-15
 """Less than wheels can give is nothing."""
 DIPOLE_A_M2_MIN = 1e-12
 """Less turns nothing."""
-ARC_S_MIN = 0.01
-"""A burn that is over sooner is an impulse; a torque or a dipole is not given for less, s."""
 WHEELS_FAILED = "the wheels have failed"
 
 
@@ -64,49 +67,6 @@ class Burn:
     def magnitude_m_s(self) -> float:
         """Magnitude of the change of velocity."""
         return math.hypot(*self.vector)
-
-
-class Tank:
-    """
-    Mass and propellant of one vehicle.
-
-    Burns are booked as they are accepted. By the rocket equation each multiplies the mass by a factor of its own, so
-    that what is left after all of them is right in whatever order they burn. Until a burn is over the tank holds
-    what is booked for it, see `left_kg`: that depends on the order of their times. One that is booked before others
-    of later times lifts more mass than they leave, and they less.
-    """
-
-    def __init__(self, vehicle: Vehicle) -> None:
-        self.mass_kg = vehicle.mass_kg
-        self.propellant_kg = vehicle.thruster.propellant_kg if vehicle.thruster else 0.0
-        """Propellant that is not booked yet."""
-        self._booked: list[tuple[float, float, float]] = []
-        """Begin and end of each burn that may not be over, s, and its propellant, kg."""
-
-    def book(self, burn: Burn, start_s: float, end_s: float, *, now_s: float) -> None:
-        """Take off the propellant of a burn between two times, and forget those that are over now."""
-        waiting = [each for each in self._booked if each[1] > now_s]
-        self._booked, own_kg = [], burn.propellant_kg
-        for begins_s, ends_s, kg in waiting:
-            # Before a later one the vehicle is still as heavy, and lighter afterwards.
-            moved_kg = burn.burnt * kg if begins_s > start_s else 0.0
-            own_kg += moved_kg
-            self._booked.append((begins_s, ends_s, kg - moved_kg))
-        self._booked.append((start_s, end_s, own_kg))
-        self.burn(burn.propellant_kg)
-
-    def left_kg(self, t_s: float) -> float:
-        """Return what the tank holds at *t_s*, not long ago or later: what burns booked until now have not burnt by then."""
-        held_kg = 0.0
-        for start_s, end_s, kg in self._booked:
-            if end_s > t_s:  # the flow of a burn is even
-                held_kg += kg if t_s <= start_s else kg * (end_s - t_s) / (end_s - start_s)
-        return self.propellant_kg + held_kg
-
-    def burn(self, propellant_kg: float) -> None:
-        """Take propellant off; less than 0 gives back what was not burnt."""
-        self.mass_kg -= propellant_kg
-        self.propellant_kg = max(0.0, self.propellant_kg - propellant_kg)
 
 
 def number_fault(command: Command) -> str:

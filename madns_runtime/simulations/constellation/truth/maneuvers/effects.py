@@ -35,6 +35,8 @@ SNAP_S = 1e-7
 SHORT = 0.1
 """Part of a knot's time: a shorter piece is drawn out over the next interval, whose position would else lose
 digits when its small steps are divided by a small time."""
+ARC_S_MIN = 0.01
+"""A burn that is over sooner is an impulse; a torque or a dipole is not given for less, s."""
 ARC_INTERVALS_MIN = 4
 """Knots in an arc of thrust, torque or dipole are at least this dense."""
 
@@ -74,6 +76,15 @@ class Effect:
             start_s=self.start_s if start_s is None else start_s,
             end_s=self.end_s if end_s is None else end_s,
         )
+
+    def drained(self, burnt: float) -> Effect:
+        """Return a burn as it is if the tank holds less for it: at the same thrust, but over sooner."""
+        gain = scaled(self.vector, math.log1p(-burnt) / math.log1p(-self.burnt))
+        end_s = self.start_s + (self.end_s - self.start_s) * burnt / self.burnt
+        effect = replace(self, vector=gain, burnt=burnt, end_s=end_s)
+        if not self.is_arc or effect.end_s - effect.start_s >= ARC_S_MIN:
+            return effect
+        return replace(effect, kind="impulse", at_s=self.start_s, end_s=self.start_s)
 
 
 class Timeline:

@@ -26,13 +26,11 @@ from madns_runtime.simulations.constellation.truth.maneuvers.account import (
     Times,
 )
 from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
-    ARC_S_MIN,
     ActuatorFailures,
     ActuatorRefusal,
     Burn,
     Given,
     Magnetisation,
-    Tank,
     WheelTurn,
     chance_of,
     fire,
@@ -44,6 +42,7 @@ from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
     vehicle_fault,
 )
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
+    ARC_S_MIN,
     SNAP_S,
     Effect,
     EffectKind,
@@ -52,9 +51,11 @@ from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
     spin_rad_s_max,
 )
 from madns_runtime.simulations.constellation.truth.maneuvers.stuck_thrusters import (
+    RAN_EMPTY,
     StuckThrusters,
     is_closure,
 )
+from madns_runtime.simulations.constellation.truth.maneuvers.tank import Tank
 
 WAITING_MAX = 64
 """Commands of one vehicle whose time is not over."""
@@ -204,10 +205,12 @@ class ManeuverDesk:
     def execute(self, taken: Taken) -> Taken:
         """Enter that a command's time is over, and return it with what its actuator holds now."""
         self._waiting[taken.vehicle] -= 1
+        attitude, effect = self._vehicles[taken.vehicle].attitude, taken.effect
+        if effect and (burn := self.stuck.drained.pop((taken.vehicle, effect.number), None)):
+            taken = replace(taken, delta_v_m_s=burn.delta_v_m_s, used_kg=burn.kg, reason=RAN_EMPTY)
         self.account.executed += 1
         self.account.delta_v_m_s += taken.delta_v_m_s
         self.account.propellant_kg += taken.used_kg
-        attitude, effect = self._vehicles[taken.vehicle].attitude, taken.effect
         if effect is None:
             return taken
         # Not what was left when it was accepted: others may have burnt since, or be booked and not have burnt.
@@ -327,8 +330,10 @@ class ManeuverDesk:
             start_s, status = snap(tick / rules.tick_hz, rules.knot_s), "postponed"
         end_s = snap(start_s + arc_s, rules.knot_s) if arc_s > 0.0 else start_s
         at_s = start_s + (end_s - start_s) / 2.0 if burn_s > 0.0 else start_s
-        if at_s > rules.duration_s:
-            over = f"{at_s:g} s is beyond the run's {rules.duration_s:g} s"
+        # Truth ends there: of what begins then it holds nothing, of a burn around the end half.
+        if start_s >= rules.duration_s or at_s > rules.duration_s:
+            where = "beyond" if at_s > rules.duration_s else "the end of"
+            over = f"{at_s:g} s is {where} the run's {rules.duration_s:g} s"
             return replace(refused, at_s=at_s, reason=over)
         effect = Effect(
             number=self._taken[refused.vehicle],
@@ -376,7 +381,7 @@ class ManeuverDesk:
         expected_kg = max(0.0, tank.propellant_kg - needed_kg)
         effect, now_s = taken.effect, taken.heard_s - taken.command.phase_s
         assert effect is not None
-        tank.book(given, effect.start_s, effect.end_s, now_s=now_s)
+        tank.book(effect, given.propellant_kg, now_s=now_s)
         return replace(
             taken,
             delta_v_m_s=given.magnitude_m_s,

@@ -3,6 +3,8 @@ Thrusters that are stuck open: they burn at their thrust, arc by arc, until clos
 
 When a burn will end is not known while it goes on, so truth is given one short arc after the other, each a little
 ahead of its time. What was given too much is cut off again: the arc under way keeps its acceleration and ends sooner.
+
+Burns that were accepted before and are yet to come have no claim to propellant: they burn after the arcs, of what is left.
 """
 
 from __future__ import annotations
@@ -15,16 +17,17 @@ from typing import Literal
 from madns_runtime.simulations.constellation.equipment import Vehicle
 from madns_runtime.simulations.constellation.messages import Command, CommandFrame
 from madns_runtime.simulations.constellation.thrust import Vector
-from madns_runtime.simulations.constellation.truth.maneuvers.actuators import (
-    ARC_S_MIN,
-    Tank,
-    exhaust_m_s,
-)
+from madns_runtime.simulations.constellation.truth.maneuvers.actuators import exhaust_m_s
 from madns_runtime.simulations.constellation.truth.maneuvers.effects import (
+    ARC_S_MIN,
     Effect,
     Timeline,
     scaled,
     snap,
+)
+from madns_runtime.simulations.constellation.truth.maneuvers.tank import (
+    BookedBurn,
+    Tank,
 )
 
 ARC_S = 5.0
@@ -33,6 +36,9 @@ AHEAD_S = 2.0
 """Before the end of an arc the next one is given."""
 STUCK_NUMBER_FIRST = 2**31
 """Arcs count from here on, effects of commands from 0."""
+
+RAN_EMPTY = "the tank ran empty: the thruster was stuck open before"
+"""Reason in the result of a burn that was accepted and gave less."""
 
 BurnState = Literal["open", "closed", "empty", "mended"]
 
@@ -114,6 +120,8 @@ class StuckThrusters:
     ) -> None:
         self.burns: dict[int, StuckBurn] = {}
         """By vehicle, those whose failure is in force."""
+        self.drained: dict[tuple[int, int], BookedBurn] = {}
+        """By vehicle and number, burns that were accepted and for which too little propellant is left."""
         self._vehicles = vehicles
         self._timelines = timelines
         self._tanks = tanks
@@ -143,6 +151,7 @@ class StuckThrusters:
         while burn.given_until_s < last_s and t_s >= burn.given_until_s - AHEAD_S:
             start_s, end_s = self._free(burn)
             end_s = min(end_s, burn.ends_s)
+            later = self._tanks[burn.vehicle].unbook_after(start_s)
             left_s = self._tanks[burn.vehicle].propellant_kg / burn.flow_kg_s
             if left_s < end_s - start_s:
                 end_s = last_s = burn.ends_s = start_s + left_s
@@ -150,6 +159,7 @@ class StuckThrusters:
             if end_s - start_s >= ARC_S_MIN:
                 self._give(burn, start_s, end_s)
                 changed_s = start_s if changed_s is None else changed_s
+            self._book_again(burn.vehicle, later)
             burn.given_until_s = max(end_s, start_s)
         burn.arcs = [arc for arc in burn.arcs if arc[0].end_s > t_s]
         return changed_s
@@ -164,7 +174,10 @@ class StuckThrusters:
         if burn.given_until_s <= at_s:
             return None
         burn.given_until_s = at_s
-        return at_s if self._cut(burn, at_s) else None
+        later = self._tanks[vehicle].unbook_after(at_s)
+        is_cut = self._cut(burn, at_s)
+        self._book_again(vehicle, later)
+        return at_s if is_cut else None
 
     def fault(self, vehicle: int, command: Command) -> str:
         """Return why a thruster that is stuck open does not do what is commanded; empty if it does."""
@@ -205,7 +218,7 @@ class StuckThrusters:
         commanded = [
             each
             for each in self._timelines[burn.vehicle].effects
-            if each.kind == "thrust" and each.number < STUCK_NUMBER_FIRST
+            if each.kind in ("thrust", "impulse") and each.number < STUCK_NUMBER_FIRST
         ]
         start_s = burn.given_until_s
         for other in commanded:
@@ -251,6 +264,15 @@ class StuckThrusters:
                 kept.append((shorter, mass_kg))
         burn.arcs = kept
         return is_cut
+
+    def _book_again(self, vehicle: int, later: Sequence[Effect]) -> None:
+        """Let burns that are yet to come burn what the arcs leave, the first one first."""
+        for effect in later:
+            booked = self._tanks[vehicle].book_again(effect)
+            self._timelines[vehicle].exchange(effect, booked.flown)
+            self.drained.pop((vehicle, effect.number), None)
+            if booked.is_drained:
+                self.drained[vehicle, effect.number] = booked
 
     def _take(self, burn: StuckBurn, duration_s: float, delta_v_m_s: float) -> None:
         """Take off what an arc burns, or give back what one that is cut does not."""

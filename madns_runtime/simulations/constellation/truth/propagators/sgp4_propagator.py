@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 from madns_runtime.errors import ConfigurationError, MissingExtraError
 from madns_runtime.simulations.constellation.orbit.constants import SECONDS_PER_DAY
 from madns_runtime.simulations.constellation.truth.element_set import ElementSet
-from madns_runtime.simulations.constellation.truth.propagation import PropagationParameters
+from madns_runtime.simulations.constellation.truth.propagation import (
+    PropagationParameters,
+    is_inside_earth,
+)
 from madns_runtime.simulations.constellation.truth.propagators.sgp4_records import (
     DECAYED,
     julian_date,
@@ -45,7 +48,7 @@ class Sgp4:
         parameters: PropagationParameters,
     ) -> NDArray[np.float64]:
         """
-        Return states at the knots, see `Propagator.propagate`; *states* and *t0_s* are not used.
+        Return states at the knots, see `Propagator.propagate`; of *states* only those inside the Earth matter, which stay.
 
         Positions are SGP4's. SGP4's own velocity leaves out parts of its positions' derivative: it
         is off by 2 cm/s in LEO and by 2 m/s for some sets. Between knots that would put a saw tooth
@@ -58,10 +61,22 @@ class Sgp4:
             raise ConfigurationError(
                 "parameters.propagator: sgp4 needs an element set for every satellite"
             )
+        # Long after its end SGP4 has no states of a satellite.
+        flying = np.flatnonzero(~is_inside_earth(states))
+        found = np.repeat(states[:, None], len(knots_s), axis=1)
+        if len(flying):
+            sets = tuple(parameters.element_sets[n] for n in flying.tolist())
+            found[flying] = self._flown(sets, parameters.epoch_utc, knots_s)
+        return found
+
+    @staticmethod
+    def _flown(
+        sets: tuple[ElementSet, ...], epoch_utc: datetime, knots_s: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the states of a fleet at the knots, shape (N, K, 6), m and m/s."""
         steps = np.array((0.0, *WEIGHTS)) * DIFFERENCE_S
         # Knots and differences often fall on the same times; each is computed once.
         times_s, place = np.unique(np.round(knots_s + steps[:, None], 9), return_inverse=True)
-        sets, epoch_utc = parameters.element_sets, parameters.epoch_utc
         found = sgp4_states(sets, epoch_utc, times_s, may_fall=True)[..., :3]
         r, *around = (found[:, row] for row in place.reshape(len(steps), -1))
         v = sum(weight * near for weight, near in zip(WEIGHTS.values(), around, strict=True))
@@ -88,7 +103,8 @@ def sgp4_states(
         element_sets: N sets.
         epoch_utc: UTC of t_s = 0.
         t_s: Times, shape (K,), s.
-        may_fall: Whether satellites may be lower than the Earth's equator is.
+        may_fall: Whether satellites may be lower than the Earth's equator is; of one that has been inside the Earth by then,
+            the first position there stands for those that SGP4 does not have any more.
 
     Returns:
         States, shape (N, K, 6), m and m/s, TEME.
@@ -104,8 +120,14 @@ def sgp4_states(
     errors, r_km, v_km_s = _fleet_records(element_sets).sgp4(
         whole + days, part + rest_s / SECONDS_PER_DAY
     )
-    if may_fall:
+    if may_fall and errors.any():
         errors = np.where(errors == DECAYED, 0, errors)
+        is_inside = (errors == 0) & is_inside_earth(r_km * 1000.0)
+        is_over = (errors > 0) & np.logical_or.accumulate(is_inside, axis=1)
+        for n in np.flatnonzero(is_over.any(axis=1)).tolist():
+            r_km[n, is_over[n]] = r_km[n, int(np.argmax(is_inside[n]))]
+            v_km_s[n, is_over[n]] = 0.0
+        errors[is_over] = 0
     faults = []
     for n in np.flatnonzero(errors.any(axis=1)).tolist():
         k = int(np.argmax(errors[n] > 0))
