@@ -21,6 +21,7 @@ import zstandard
 
 from cosmos_cli.evidence.run_directory import RESERVE_NAME, SCHEMA, RunDirectory
 from cosmos_cli.evidence.streams import StreamScan
+from madns_runtime.bounded_files import open_regular_file
 from madns_runtime.partial_file import partial_file
 from madns_runtime.recording.access import file_mode
 
@@ -155,7 +156,7 @@ def first_still_packed(run: RunDirectory, entries: Mapping[str, Mapping[str, Any
     # A package that is cut or damaged holds what comes before.
     with (
         contextlib.suppress(OSError, EOFError, tarfile.TarError, zstandard.ZstdError),
-        run.bundle.open("rb") as raw,
+        os.fdopen(open_regular_file(run.bundle), "rb") as raw,
         zstandard.ZstdDecompressor().stream_reader(raw) as packed,
         tarfile.open(fileobj=packed, mode="r|") as archive,
     ):

@@ -295,7 +295,7 @@ class InlineDevice:
         """
         try:
             return call(*arguments)
-        except BaseException as error:
+        except BaseException as error:  # a driver may raise anything
             text = describe_exception(error, f"{type(self._device).__name__}.{method}", call)
             raise BlamedError(f"device {self.name}: {text}") from error
 
@@ -332,6 +332,6 @@ def _made(launch: DeviceLaunch, program: DeviceProgram) -> Device:
         return program.make()
     except MadnsError:
         raise
-    except BaseException as error:
+    except BaseException as error:  # a driver may raise anything
         text = describe_exception(error, f"{launch.kind}.__init__")
         raise BlamedError(f"device {launch.name}: {text}") from error

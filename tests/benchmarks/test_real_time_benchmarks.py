@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from madns_runtime.timing.rate import Pacer
+
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
 import scale  # noqa: E402 - behind the line that says where they are
@@ -14,8 +16,6 @@ import soak  # noqa: E402
 import star  # noqa: E402
 import star_transports  # noqa: E402
 import stars  # noqa: E402
-
-from madns_runtime.timing.rate import Pacer  # noqa: E402
 
 
 def test_a_shape_has_the_packs_and_the_phases_of_a_run():

@@ -140,17 +140,17 @@ def sleep_until(loop, clock, due_s, late_s=0.0):
 
 
 @pytest.mark.parametrize(
-    ("waited_s", "written_s", "named"),
+    ("others_s", "named"),
     [
-        (0.004, 0.0, Cause.WAKE_UP),
-        (0.0, 0.004, Cause.RECORDING),
-        (0.001, 0.0, Cause.STOLEN),
-        (math.inf, 0.0, Cause.STOLEN),
+        ({"waited": 0.004}, Cause.WAKE_UP),
+        ({"written": 0.004}, Cause.RECORDING),
+        ({"waited": 0.001}, Cause.STOLEN),
+        ({"waited": math.inf}, Cause.STOLEN),
     ],
 )
 @pytest.mark.parametrize("stolen_s", [0.01, 0.02])
 def test_what_was_stolen_is_the_cause_of_no_more_than_nothing_else_explains(
-    loop, clock, stolen_s, waited_s, written_s, named
+    loop, clock, stolen_s, others_s, named
 ):
     """Counted is what was stolen from all processors since a while before the tick, and seven others were in time."""
     due_s = clock.now_s + PERIOD_S
@@ -158,8 +158,8 @@ def test_what_was_stolen_is_the_cause_of_no_more_than_nothing_else_explains(
     loop.kernel["stolen"] += stolen_s
     for number in range(1, 8):
         sleep_until(loop, clock, due_s + number * PERIOD_S)
-    loop.kernel["waited"] += waited_s
-    loop.writer.computed_s = written_s
+    loop.kernel["waited"] += others_s.get("waited", 0.0)
+    loop.writer.computed_s = others_s.get("written", 0.0)
 
     late = sleep_until(loop, clock, due_s + 8 * PERIOD_S, late_s=0.004)
 

@@ -33,26 +33,25 @@ def paths(tmp_path):
 
 @pytest.mark.process
 @pytest.mark.parametrize(
-    ("option", "word", "told"),
+    ("asked", "told"),
     [
         (
-            "--agents",
-            "agent-03",
+            "--agents agent-03",
             "no agent of these scenarios is called so; there are agent-01, agent-02",
         ),
-        ("--streams", "round_trip", "record no such stream, did you mean round_trips?"),
-        ("--streams", "ticks", "these scenarios record no such stream"),
+        ("--streams round_trip", "record no such stream, did you mean round_trips?"),
+        ("--streams ticks", "these scenarios record no such stream"),
     ],
 )
 def test_a_word_that_will_choose_nothing_is_refused_before_the_first_run(
-    paths, tmp_path, capsys, option, word, told
+    paths, tmp_path, capsys, asked, told
 ):
-    words = ["diff", "--run", *map(str, paths), option, word, "--runs", str(tmp_path / "runs")]
+    words = ["diff", "--run", *map(str, paths), *asked.split(), "--runs", str(tmp_path / "runs")]
 
     code = app.run(words)
 
     assert code == 2
-    assert f"{option} {word}: " in (err := capsys.readouterr().err)
+    assert f"{asked}: " in (err := capsys.readouterr().err)
     assert told in err
     assert not (tmp_path / "runs").exists()
 

@@ -241,6 +241,7 @@ def test_lockstep_is_not_held_against_real_time(
     assert findings_of("feasibility", answer) == []
 
 
+@pytest.mark.usefixtures("told")
 @pytest.mark.parametrize(
     ("agents", "level"),
     [
@@ -252,7 +253,6 @@ def test_lockstep_is_not_held_against_real_time(
     ],
 )
 def test_agents_are_held_against_the_processors_as_a_plan_does(
-    told: Callable[..., None],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
