@@ -4,6 +4,8 @@ VENV ?= .venv
 RUNNABLE = $(VENV)/.runnable
 READY = $(VENV)/.ready
 MEASURED = tests/protocol tests/timing
+# Options of pytest's that choose some of those tests: `make test CHOSEN=--first-of-each-file` asks whether a machine has what they need.
+CHOSEN ?=
 QUICK = not process and not root and not browser and not nightly and not slow
 PIP = $(VENV)/bin/python -m pip install --quiet
 
@@ -28,7 +30,7 @@ tested: $(READY)
 	@$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/.collected 2>&1 || cat $(VENV)/.collected
 	@$(MAKE) --no-print-directory measured
 	@$(MAKE) --no-print-directory unmeasured
-	MAKEFLAGS= $(VENV)/bin/python -m pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED))
+	MAKEFLAGS= $(VENV)/bin/python -m pytest --numprocesses 6 --dist loadfile --no-loadscope-reorder --durations=25 $(addprefix --ignore=,$(MEASURED)) $(CHOSEN)
 
 lint: $(READY)
 	$(VENV)/bin/ruff check .

@@ -47,12 +47,23 @@ SLOWNESS = {"slow": 6, "root": 6, "browser": 3, "process": 1}
 """How long a test with a marker takes, very roughly, beside one that starts a process."""
 
 
+def pytest_addoption(parser):
+    """Let somebody ask whether a machine has what the suite needs, without all of it."""
+    parser.addoption(
+        "--first-of-each-file",
+        action="store_true",
+        help="only the first test of each file, and its first of each marker of what it starts",
+    )
+
+
 def pytest_collection_modifyitems(config, items):
     """
     Bring the files to the front that may take longest, then those whose tests start processes or compute for long.
 
     So that at the end, when workers run out of files, none of them is a long one. The order within a file stays.
     """
+    if config.option.first_of_each_file:
+        keep_first_of_each_file(config, items)
     limits_s, slowness = {}, {}
     for item in items:
         if is_left_out(config, item):
@@ -62,6 +73,17 @@ def pytest_collection_modifyitems(config, items):
         marked = [weight for name, weight in SLOWNESS.items() if item.get_closest_marker(name)]
         slowness[item.path] = slowness.get(item.path, 0) + max(marked, default=0)
     items.sort(key=lambda item: (-limits_s.get(item.path, 0), -slowness.get(item.path, 0)))
+
+
+def keep_first_of_each_file(config, items):
+    """Deselect every test before which one of its file had the same of the markers in `SLOWNESS`."""
+    first, others = {}, []
+    for item in items:
+        markers = frozenset(name for name in SLOWNESS if item.get_closest_marker(name))
+        if is_left_out(config, item) or first.setdefault((item.path, markers), item) is not item:
+            others.append(item)
+    config.hook.pytest_deselected(items=others)
+    items[:] = first.values()
 
 
 def is_left_out(config, item):

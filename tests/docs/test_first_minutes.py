@@ -137,5 +137,6 @@ def test_both_commands_of_the_readme_work_on_a_minimal_debian(tmp_path):
     assert "Traceback" not in demo.stderr
     assert (fresh.root / "home/student/cosmos/runs/0001-iridium10/report.html").is_file()
 
-    tested = fresh.run("make test")
+    # What all tests say is CI's to ask: here, whether anything that they need is missing.
+    tested = fresh.run("make test CHOSEN=--first-of-each-file")
     assert tested.returncode == 0, told_by(tested)

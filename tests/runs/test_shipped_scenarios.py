@@ -18,7 +18,9 @@ REALTIME_MAX_S = 70
 """Until the latest check of any of them has begun."""
 ALONE = "starlink1000 or planet93_100hz"
 """They want all processors of a small machine; benchmarks/scale.py flies them."""
-NIGHTLY = f"not (hardware or emulator or {ALONE} or {SAME})"
+FLOWN = "chain77 or ring93_gap"
+"""tests/constellation/test_slots_benchmark.py flies them for their day, and wants more of them than their verdict."""
+NIGHTLY = f"not (hardware or emulator or {ALONE} or {SAME} or {FLOWN})"
 
 
 def suite(folder, *words, patience_s):
