@@ -13,17 +13,18 @@ x86-64 virtual machine (`TickCosts`); another machine's speed is a factor, 1 if 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from cosmos_cli.launch.feasibility import (
-    COUNT_MAX,
     IP_UDP_BYTES,
     Resources,
     finite,
+    has_maneuvers,
     is_within,
     judge,
+    largest,
 )
 from cosmos_cli.models.scenario import Scenario
 from madns_runtime.plugin.api import Demand
@@ -138,7 +139,8 @@ def predict_capacity(  # noqa: PLR0913 - all but four by name
         resources.workers_for(demand),
     )
     granted = receive_buffer_bytes or 2 * scenario.network.receive_buffer_bytes
-    limits = [load.host_loop(), load.all_workers(), load.one_process()]
+    limits = [load.host_loop(), load.all_workers(), load.maneuvers(resources.maneuvers_at_once)]
+    limits.append(load.one_process())
     limits += map(load.whole, computers)
     limits += _inequalities(demand, resources, tick_hz)
     limits.append(_burst(demand, granted))
@@ -181,11 +183,16 @@ class _ProcessorLoad:
         ticks_s = agents * (self.costs.tick_s + self.demand.step_s)
         return (packs * self.costs.wake_up_s + ticks_s) * self.tick_hz
 
-    def truth_s(self, agents: int) -> float:
-        """Return what the host's workers compute for so many agents, batches and maneuvers, s per second, at speed 1."""
+    @property
+    def batches_s(self) -> float:
+        """What the host's workers compute for an agent's batches, s per second, at speed 1."""
         demand = self.demand
-        batches = demand.batch_compute_s / demand.buffer_s if demand.buffer_s > 0.0 else 0.0
-        return agents * (batches + demand.sync_rate_hz * demand.sync_compute_s)
+        return demand.batch_compute_s / demand.buffer_s if demand.buffer_s > 0.0 else 0.0
+
+    @property
+    def maneuvers_s(self) -> float:
+        """What they compute for an agent's maneuvers over a long time, s per second, at speed 1."""
+        return self.demand.sync_rate_hz * self.demand.sync_compute_s
 
     def host_loop(self) -> Limit:
         each_s = self.costs.exchange_s * self.tick_hz / self.host.speed
@@ -197,12 +204,12 @@ class _ProcessorLoad:
 
     def all_workers(self) -> Limit:
         """Return the limit of the host's workers: all batches, and maneuvers at their rate over a long time."""
-        each = self.truth_s(1) / self.host.speed
+        each = (self.batches_s + self.maneuvers_s) / self.host.speed
         maneuvers_hz = self.demand.sync_rate_hz
         what = f"batches and {maneuvers_hz:.3g} maneuvers a second" if maneuvers_hz else "batches"
         return Limit(
             name="host's workers",
-            agents=_largest(lambda agents: is_within(agents * each, self.workers)),
+            agents=largest(lambda agents: is_within(agents * each, self.workers)),
             why=f"{each:.2g} of a worker per agent for {what}, N_p = {self.workers}",
         )
 
@@ -216,18 +223,40 @@ class _ProcessorLoad:
 
         return Limit(
             name="process of agents",
-            agents=_largest(fits),
+            agents=largest(fits),
             why=f"agents.per_process {self.per_process}, one thread each",
+        )
+
+    def used_s(self, agents: int, computer: ComputerFacts) -> float:
+        """Return what all of them cost a machine but for the truth of maneuvers, s per second, at speed 1."""
+        used = self.agents_s(self.share(agents, computer), self.per_process)
+        if computer.is_host:
+            used += agents * (self.costs.exchange_s * self.tick_hz + self.batches_s)
+        return used
+
+    def maneuvers(self, at_once: int | None) -> Limit:
+        """Return the limit of maneuvers of one instant: their truth within the lead, by what ticks leave of the host's processors."""
+        host, demand = self.host, self.demand
+
+        def fits(agents: int) -> bool:
+            ticks = self.used_s(agents, host) / host.speed
+            left = max(0.0, min(self.workers, host.processors - ticks))
+            truth_s = min(at_once or agents, agents) * demand.sync_compute_s / host.speed
+            return is_within(truth_s, left * demand.lead_s)
+
+        count = "one of each agent" if at_once is None else f"{at_once} at most"
+        return Limit(
+            name="maneuvers of one instant",
+            agents=largest(fits) if has_maneuvers(demand) else math.inf,
+            why=f"{count} within {demand.lead_s:g} s, by what ticks leave of the host's processors",
         )
 
     def whole(self, computer: ComputerFacts) -> Limit:
         """Return the limit of all processors of a machine together."""
 
         def used_s(agents: int) -> float:
-            used = self.agents_s(self.share(agents, computer), self.per_process)
-            if computer.is_host:
-                used += agents * self.costs.exchange_s * self.tick_hz + self.truth_s(agents)
-            return used
+            maneuvers_s = agents * self.maneuvers_s if computer.is_host else 0.0
+            return self.used_s(agents, computer) + maneuvers_s
 
         allowed_s = SHARE_USABLE * computer.processors * computer.speed
         does = " and ".join(
@@ -237,7 +266,7 @@ class _ProcessorLoad:
         )
         return Limit(
             name=f"processors of {computer.name}",
-            agents=_largest(lambda agents: used_s(agents) <= allowed_s),
+            agents=largest(lambda agents: used_s(agents) <= allowed_s),
             why=f"{does} on {computer.processors} of speed {computer.speed:g}",
         )
 
@@ -269,18 +298,3 @@ def kernel_bytes(message_bytes: int) -> int:
     """Return the bytes that Linux books for a waiting datagram of one message (its truesize)."""
     room = message_bytes + IP_UDP_BYTES + SKB_HEADER_BYTES + SKB_TAIL_BYTES
     return SKB_OVERHEAD_BYTES + int(2 ** math.ceil(math.log2(room)))
-
-
-def _largest(fits: Callable[[int], bool]) -> float:
-    """Return the largest number of agents that fits; 0 if none does, infinity if COUNT_MAX does."""
-    if not fits(1):
-        return 0
-    low, high = 1, 2
-    while fits(high):
-        low, high = high, 2 * high
-        if low >= COUNT_MAX:
-            return math.inf
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low

@@ -308,17 +308,22 @@ def wire_bytes(message_bytes: int) -> int:
     return message_bytes + datagrams * (DATAGRAM_OVERHEAD_BYTES + IP_UDP_BYTES)
 
 
-def _first_beyond(left: Callable[[int], float], allowed: float) -> float:
-    """Return the smallest n >= 1 at which a left side that grows with n is beyond; infinity if none is below COUNT_MAX."""
+def largest(fits: Callable[[int], bool]) -> float:
+    """Return the largest number of agents that fits, where fewer do, too; 0 if none does, infinity if COUNT_MAX does."""
     low, high = 0, 1
-    while is_within(left(high), allowed):
+    while fits(high):
         low, high = high, 2 * high
         if low >= COUNT_MAX:
             return math.inf
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if is_within(left(middle), allowed) else (low, middle)
-    return high
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
+
+
+def _first_beyond(left: Callable[[int], float], allowed: float) -> float:
+    """Return the smallest n >= 1 at which a left side that grows with n is beyond; infinity if none is below COUNT_MAX."""
+    return largest(lambda count: is_within(left(count), allowed)) + 1
 
 
 def is_within(used: float, allowed: float) -> bool:

@@ -113,6 +113,7 @@ def check_run(console: Console, rehearsal: Rehearsal, asked: Asked) -> int:
         {
             "plan": rehearsal.plan.to_mapping(),
             "feasibility": pace.feasibility.to_mapping() if pace.feasibility else None,
+            "capacity": pace.capacity.to_mapping() if pace.capacity else None,
             "warnings": list(pace.warnings),
             "here": [asdict(obstacle) for obstacle in here],
             "machines": [_mapping(outcome, there) for outcome in outcomes],
@@ -224,10 +225,17 @@ class RehearsedPace:
         """Warnings for a person before the run."""
         if self.unknown:
             return (f"whether it keeps real time is not known: {self.unknown}",)
-        if self.feasibility is None or self.feasibility.holds:
+        if self.feasibility is None:
             return ()
-        told = broken_words(self.feasibility)
-        return (f"it cannot keep real time ({told}; `cosmos plan` shows up to how many agents)",)
+        if not self.feasibility.holds:
+            told = broken_words(self.feasibility)
+            return (
+                f"it cannot keep real time ({told}; `cosmos plan` shows up to how many agents)",
+            )
+        if self.capacity is not None and self.feasibility.agents > self.capacity.agents:
+            fewer = f"up to {self.capacity.agents:.0f} agents are predicted, by {self.capacity.binding.name}"
+            return (f"it may not keep real time ({fewer}; `cosmos bench capacity` tells)",)
+        return ()
 
     def show(self, console: Console) -> None:
         """Print them."""

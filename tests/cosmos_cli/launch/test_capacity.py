@@ -83,6 +83,18 @@ def test_workers_have_batches_and_every_maneuver_to_compute():
     assert limit(predicted(demand=asked), "processors of here") == 1.6 // (0.025 + 0.044)
 
 
+def test_maneuvers_of_one_instant_have_what_ticks_leave_of_the_hosts_processors():
+    asked = dataclasses.replace(NOTHING, sync_bytes=100, sync_compute_s=0.01, lead_s=10.0)
+    name = "maneuvers of one instant"
+
+    # 25 ms per second are an agent's ticks: n x 10 ms within 10 s x (2 - n x 25 ms).
+    assert limit(predicted(demand=asked, workers=2), name) == 20.0 // 0.26
+    # One worker computes on one processor, as long as ticks leave it one: up to 40 agents.
+    assert limit(predicted(demand=asked, hz=1), name) == 1000
+    assert limit(predicted(demand=asked, workers=2, maneuvers_at_once=10), name) == 79
+    assert limit(predicted(), name) == math.inf
+
+
 def test_a_burst_must_fit_the_granted_buffer():
     # Linux' default of 208 KiB holds 277 small datagrams and 92 of 1400 bytes.
     assert limit(predicted(buffer=212_992), "receive buffer of the host") == 277

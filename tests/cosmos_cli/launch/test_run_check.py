@@ -53,7 +53,9 @@ def test_plan_and_inequalities_are_shown_as_help_promises(place, capsys):
 
     assert "agent-01, agent-02, agent-03" in told
     assert "3 agents keep real time" in told
-    assert check(capsys)[1]["feasibility"]["holds"] is True
+    _, answer = check(capsys)
+    assert answer["feasibility"]["holds"] is True
+    assert answer["capacity"]["agents"] >= 3
 
 
 def test_lockstep_is_shown_without_inequalities(place, capsys):
@@ -84,6 +86,13 @@ def test_more_agents_than_are_predicted_are_not_said_to_keep_real_time(place, ca
 
     told = capsys.readouterr().out
     assert "3 agents may not keep real time: the inequalities hold, but up to 0 are" in told
+    doubt = "but it may not keep real time (up to 0 agents are predicted, by "
+    assert doubt in told.splitlines()[-1]
+    _, answer = check(capsys, *quick)
+    assert answer["feasibility"]["holds"] is True
+    assert answer["capacity"]["agents"] == 0
+    (warning,) = answer["warnings"]
+    assert answer["capacity"]["binding"] in warning
 
 
 @pytest.mark.process
