@@ -24,6 +24,11 @@ pytest_plugins = ["tower.fixtures"]  # of tests/tower; costs nothing where no te
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# What somebody has set for runs of their own, such as where these lie, is no test's.
+for name in [name for name in os.environ if name.startswith("COSMOS_")]:
+    if not name.startswith(("COSMOS_TOWER", "COSMOS_TEST_")):
+        del os.environ[name]
+
 # Some set this for themselves; each process of a run would compile all of COSMoS and its libraries anew,
 # which is more than half of what the whole suite costs then.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
