@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, get_args
 
 import typer
 
-from cosmos_cli.commands.device_trials import Trial, recorded
+from cosmos_cli.commands.device_trials import Trial, is_bad, recorded, shortcomings
 from cosmos_cli.errors import ExitCode, InputError
 from cosmos_cli.fleet.fleet import Fleet
 from cosmos_cli.launch.calibration import (
@@ -146,10 +146,11 @@ def calibrate_device(console: Console, fleet: Fleet, wish: CalibrationWish, seco
         )
     found = []
     with tempfile.TemporaryDirectory(prefix="cosmos-calibrate-") as folder:
+        guide = _Guide(trial, Path(folder))
         for sensor in sensors:
             try:
                 channel = channels.one(sensor, wish.channel)
-                folders = getattr(_Guide(trial, Path(folder)), sensor)()
+                folders = getattr(guide, sensor)()
                 found.append(
                     calibrate(
                         sensor,
@@ -164,7 +165,7 @@ def calibrate_device(console: Console, fleet: Fleet, wish: CalibrationWish, seco
             except KeyboardInterrupt:
                 _tell_interrupted(console, wish.device, sensor, found)
                 raise
-    return _show(console, trial.launches[0].name, found)
+    return _show(console, trial.launches[0].name, found, failures=guide.failures)
 
 
 def _tell_interrupted(
@@ -182,6 +183,8 @@ class _Guide:
     def __init__(self, trial: Trial, folder: Path) -> None:
         self._trial, self._folder = trial, folder
         self._say = trial.console.say
+        self.failures: list[str] = []
+        """How the device failed while it was recorded, though it gave samples."""
 
     def gyro(self) -> list[Path]:
         """Record once, at rest."""
@@ -210,11 +213,22 @@ class _Guide:
 
     def _record(self, name: str, seconds: float | None = None) -> Path:
         directory = self._folder / name
-        recorded(self._trial, directory, seconds=seconds)
+        told = recorded(self._trial, directory, seconds=seconds)
+        lacks = [f"{name}: {text}" for text in shortcomings(told)]
+        for text in lacks:
+            self._trial.console.warn(text)
+        if is_bad(told):
+            self.failures += lacks
         return directory
 
 
-def _show(console: Console, device: str, found: Sequence[SensorCalibration]) -> int:
+def _show(
+    console: Console,
+    device: str,
+    found: Sequence[SensorCalibration],
+    *,
+    failures: Sequence[str] = (),
+) -> int:
     if rows := [row for each in found for row in _rows(each)]:
         console.table(COLUMNS, rows)
     for each in found:
@@ -227,9 +241,17 @@ def _show(console: Console, device: str, found: Sequence[SensorCalibration]) -> 
     usable = [each for each in found if each.is_usable]
     if usable:
         console.data(pasteable(device, usable))
-    code = ExitCode.OK if len(usable) == len(found) else ExitCode.RUN_FAILED
+    is_whole = len(usable) == len(found) and not failures
+    code = ExitCode.OK if is_whole else ExitCode.RUN_FAILED
     told: dict[str, Any] = {"device": device, "sensors": [to_document(each) for each in found]}
-    console.print_json({**told, "yaml": pasteable(device, usable), "exit_code": int(code)})
+    console.print_json(
+        {
+            **told,
+            "failures": list(failures),
+            "yaml": pasteable(device, usable),
+            "exit_code": int(code),
+        }
+    )
     return int(code)
 
 

@@ -261,3 +261,40 @@ def test_positions_need_a_terminal(
 
     assert code == 2
     assert "give all of them with --from" in found["said"]
+
+
+TREMBLING = """
+import time
+from madns_runtime.hardware.contract import Channel, Device, DeviceKind, Sample
+
+class Gyro(Device):
+    kind = DeviceKind(
+        name="gyro", summary="a gyroscope that fails at times",
+        channels=(Channel(name="rate", unit="deg/s", shape=(3,), components=("x", "y", "z")),),
+    )
+    reads = 0
+    def read(self):
+        self.reads += 1
+        if self.reads % 20 == 0:
+            raise OSError("the bus gave no answer")
+        return Sample(values={"rate": (0.8, 0.0, 0.01 * (self.reads % 3))}, taken_s=time.monotonic())
+"""
+
+
+@pytest.mark.process
+def test_a_device_that_failed_meanwhile_is_told_and_ends_its_calibration_with_1(
+    told: Told, tmp_path: Path
+) -> None:
+    (tmp_path / "gyro.py").write_text(TREMBLING)
+    inventory = tmp_path / "here.yaml"
+    device = "{name: imu, kind: './gyro.py:Gyro', rate_hz: 100}"
+    inventory.write_text(
+        f"all: {{hosts: {{here: {{ansible_connection: local, cosmos_devices: [{device}]}}}}}}\n"
+    )
+
+    code, found = told("imu", "gyro", "-i", inventory, "--seconds", 2.0)
+
+    assert code == 1, found
+    assert found["sensors"][0]["is_usable"]
+    (failure,) = found["failures"]
+    assert failure.startswith("rest: Gyro.read raised OSError: the bus gave no answer")
