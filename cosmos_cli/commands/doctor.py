@@ -33,7 +33,8 @@ from cosmos_cli.fleet.outcome import Outcome, failed, failure_teller
 from cosmos_cli.fleet.pool import for_each
 from cosmos_cli.fleet.retry_file import offer_retry
 from cosmos_cli.fleet.target import Target
-from cosmos_cli.launch.capacity import ComputerFacts, processor_limits
+from cosmos_cli.launch.capacity import ComputerFacts, predict_capacity, processor_limits
+from cosmos_cli.launch.capacity_view import computers_of
 from cosmos_cli.launch.device_sampling import missing_for
 from cosmos_cli.launch.plan import LaunchPlan, make_plan
 from cosmos_cli.launch.plan_view import demand_of, feasibility_of, latency_of, resources_of
@@ -214,22 +215,24 @@ class _Examination:
                 interface=interface,
             )
             living = [entry["run_directory"] for entry in told["cosmos"]["living"]]
-            told["here"] = look_here(living) | {
-                "feasibility": self._feasibility(outcomes),
-                "devices": self._devices,
-            }
+            told["here"] = look_here(living) | self._pace(outcomes) | {"devices": self._devices}
             return told
 
         return for_each([target], task)[0]
 
-    def _feasibility(self, outcomes: Sequence[Outcome[Told]]) -> dict[str, Any] | None:
-        """Hold the four inequalities against the network as it was measured; None in lockstep, and without a demand."""
+    def _pace(self, outcomes: Sequence[Outcome[Told]]) -> dict[str, Any]:
+        """
+        Hold the four inequalities against the network as it was measured, and predict how many agents fit.
+
+        Both are None in lockstep, and without a demand.
+        """
+        unknown: dict[str, Any] = {"feasibility": None, "capacity": None}
         if self._scenario_file is None or self._plan is None or self._plan.is_lockstep:
-            return None
+            return unknown
 
         self._demand = demand_of(self._scenario_file)
         if self._demand is None:
-            return None
+            return unknown
 
         trips_ms = [
             trip["p50_ms"]
@@ -244,8 +247,11 @@ class _Examination:
             given_ms = self._scenario_file.scenario.plan.latency_ms
             latency_s, _ = latency_of(self._plan, given_ms=given_ms)
         resources = resources_of(self._scenario_file, self._plan, latency_s)
-        found = feasibility_of(self._scenario_file, resources, self._demand)
-        return None if found is None else found.to_mapping()
+        feasibility = feasibility_of(self._scenario_file, resources, self._demand)
+        capacity = predict_capacity(
+            self._scenario_file.scenario, self._demand, computers_of(self._plan), resources
+        )
+        return {"feasibility": feasibility.to_mapping(), "capacity": capacity.to_mapping()}
 
     def _bounds(self, outcomes: Sequence[Outcome[Told]]) -> dict[str, AgentBound]:
         """Return how many agents each machine's processors are predicted to bear in real time; this computer is the host."""

@@ -110,7 +110,7 @@ def cut_off(case: Case) -> Iterator[CheckRemark]:
 
 
 def feasibility(case: Case) -> Iterator[CheckRemark]:
-    """The four inequalities of real time, with the network as it was measured."""
+    """The four inequalities of real time, with the network as it was measured, and what is predicted besides."""
     told = case.part("here").get("feasibility")
     if not told:
         return
@@ -124,7 +124,16 @@ def feasibility(case: Case) -> Iterator[CheckRemark]:
             cure="`cosmos plan` shows all four"
             + (f"; fewer than {limit:g} agents keep it" if limit and limit > 1 else ""),
         )
-    if not broken:
+    if broken:
+        return
+    agents = counted(told["agents"], "agent")
+    capacity = case.part("here").get("capacity")
+    if capacity and capacity["agents"] is not None and told["agents"] > capacity["agents"]:
         yield CheckRemark(
-            found=f"{counted(told['agents'], 'agent')} can keep real time (the four inequalities hold)"
+            level=Severity.WARNING,
+            found=f"{agents} may not keep real time: the four inequalities hold, but up to {capacity['agents']:g} are"
+            f" predicted, by {capacity['binding']}",
+            cure="`cosmos plan` shows all limits, `cosmos bench capacity` measures",
         )
+    else:
+        yield CheckRemark(found=f"{agents} can keep real time (the four inequalities hold)")

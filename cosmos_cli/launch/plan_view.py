@@ -105,12 +105,9 @@ def resources_of(
 
 
 def feasibility_of(
-    scenario_file: ScenarioFile, resources: Resources, demand: Demand | None = None
-) -> Feasibility | None:
-    """Return None for a simulation that does not tell what it asks for; asks it if *demand* is not given."""
-    demand = demand or demand_of(scenario_file)
-    if demand is None:
-        return None
+    scenario_file: ScenarioFile, resources: Resources, demand: Demand
+) -> Feasibility:
+    """Hold a scenario's agents against what its simulation asks for."""
     agents = scenario_file.scenario.agents
     return judge(demand, resources, agents=agents.count, tick_hz=agents.tick_hz)
 

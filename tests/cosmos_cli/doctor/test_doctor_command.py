@@ -218,12 +218,14 @@ def test_inequalities_of_a_run_on_this_computer_are_those_of_its_plan(
     told: Callable[..., None], quick_scenario: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plan_code = cosmos(["plan", quick_scenario, "--json"])
-    planned = json.loads(capsys.readouterr().out)["feasibility"]
+    planned = json.loads(capsys.readouterr().out)
     code = cosmos(["doctor", quick_scenario, "--json"])
     answer = json.loads(capsys.readouterr().out)
 
     assert (plan_code, code) == (0, 0)
-    assert answer["machines"][0]["probed"]["here"]["feasibility"] == planned
+    here = answer["machines"][0]["probed"]["here"]
+    assert here["feasibility"] == planned["feasibility"]
+    assert here["capacity"] == planned["capacity"]
     assert [each["level"] for each in findings_of("feasibility", answer)] == ["ok"]
 
 
