@@ -110,6 +110,7 @@ def test_slot_keeping_brings_the_ring_to_even_spacing_in_a_day_with_little_delta
     assert {one["neighbours"] for one in finished} == {2}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_chain_whose_middle_dies_keeps_one_phase_over_the_gap():
     # Half a wave of error along the chain, and after five hours two of its middle fall silent.
@@ -150,6 +151,7 @@ def test_slot_keeping_leaves_orbits_round():
     assert max(math.hypot(mean.ex, mean.ey) for mean in means) < 6e-5
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_slot_keeping_with_burns_of_the_wrong_sign_scatters_the_ring():
     fleet = slot_keepers(tick_s=60.0, sign=-1.0)
@@ -170,6 +172,7 @@ def test_drag_phasing_brings_the_ring_to_even_spacing_without_propellant():
     assert all(one.finish()["commands"] > 1 for one in fleet.software)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_drag_phasing_with_high_and_low_exchanged_scatters_the_ring():
     fleet = drag_keepers(sign=-1.0)

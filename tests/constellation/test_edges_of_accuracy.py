@@ -77,7 +77,10 @@ def after_a_day(settings, states, window_s):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("perigee_km", [150, pytest.param(185, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "perigee_km",
+    [pytest.param(150, marks=pytest.mark.nightly), pytest.param(185, marks=pytest.mark.nightly)],
+)
 def test_drag_through_a_low_perigee_errs_centimetres_in_a_day(perigee_km):
     pytest.importorskip("numba")
     forces = ("two_body", "j2", "drag")

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from harness.nights import by_night
 
 from madns_runtime.simulations.constellation.flight.api import Reading
 from madns_runtime.simulations.constellation.flight.gossip import (
@@ -107,20 +108,22 @@ def wave_deg(count):
     return 0.28 * np.cos(math.pi * (np.arange(count) + 0.5) / count)
 
 
+COMMON_PHASES = [
+    (40, 80, {"loss": 0.3, "dead": (0, 1, 20)}),
+    (93, 46, {}),
+    (77, 76, {"spacing_deg": 2.0}),
+    # Two neighbours dead: asked across the gap after some rounds, half the ring further on.
+    (93, 46 + SILENT_ROUNDS + 4, {"dead": (45, 46)}),
+    # So wide a gap that nobody is in reach across it: news goes the other way round.
+    (93, 81, {"dead": range(40, 51)}),
+    (93, 60, {"loss": 0.1}),
+    (77, 110, {"spacing_deg": 2.0, "loss": 0.1}),
+]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("count", "rounds", "options"),
-    [
-        (93, 46, {}),
-        (77, 76, {"spacing_deg": 2.0}),
-        # Two neighbours dead: asked across the gap after some rounds, half the ring further on.
-        (93, 46 + SILENT_ROUNDS + 4, {"dead": (45, 46)}),
-        # So wide a gap that nobody is in reach across it: news goes the other way round.
-        (93, 81, {"dead": range(40, 51)}),
-        (93, 60, {"loss": 0.1}),
-        (77, 110, {"spacing_deg": 2.0, "loss": 0.1}),
-        (40, 80, {"loss": 0.3, "dead": (0, 1, 20)}),
-    ],
+    ("count", "rounds", "options"), by_night(COMMON_PHASES, day=COMMON_PHASES[:2])
 )
 def test_everybody_knows_the_common_phase_after_as_many_rounds_as_lie_between(
     count, rounds, options

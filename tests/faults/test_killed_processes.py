@@ -18,6 +18,7 @@ from fault_harness import (
     wait_until_ended,
 )
 from faulty_simulation import INIT_DELAY
+from harness.nights import by_night
 
 from madns_runtime.recording.reader import read_stream
 
@@ -58,7 +59,9 @@ def kill_in_run(laboratory: Laboratory, *arguments: str) -> Run:
     return run
 
 
-WHEN = pytest.mark.parametrize("start_and_kill", [kill_before_hello, kill_in_setup, kill_in_run])
+WHEN = pytest.mark.parametrize(
+    "start_and_kill", by_night([kill_before_hello, kill_in_setup, kill_in_run], day=[kill_in_run])
+)
 
 
 def first_tick(path: Path) -> int:
@@ -213,7 +216,13 @@ def test_not_even_a_process_stuck_in_a_plugin_survives_a_killed_operator(laborat
     assert ("host: " if side == "host" else "agent-02: ") in collected.stderr
 
 
-@pytest.mark.parametrize("text", ["records go to", "waiting for agents", "agents are setting up"])
+@pytest.mark.parametrize(
+    "text",
+    by_night(
+        ["records go to", "waiting for agents", "agents are setting up"],
+        day=["waiting for agents"],
+    ),
+)
 def test_nothing_survives_an_operator_that_is_killed_before_the_run(laboratory, text):
     faults = {"side": "agent", "method": "setup", "action": "sleep", "sleep_s": 1.0}
     run = laboratory.start(*LONG, faults=faults)

@@ -11,6 +11,7 @@ from fault_harness import (
     do_on_import,
     hang_on_import,
 )
+from harness.nights import by_night
 
 pytestmark = pytest.mark.process
 
@@ -25,6 +26,8 @@ AT_ONCE = {"tick": 0}
 HOST_METHODS = ("setup", "initial_data", "start", "receive", "timer", "result", "finish")
 AGENT_METHODS = ("setup", "step", "receive", "finish")
 CASES = [("host", method) for method in HOST_METHODS] + [("agent", m) for m in AGENT_METHODS]
+BY_DAY = [("host", "receive"), ("host", "finish"), ("agent", "setup"), ("agent", "step")]
+SIDES = by_night([("host", "receive"), ("agent", "step")], day=[("agent", "step")])
 
 
 def line_of(comment: str) -> int:
@@ -32,9 +35,10 @@ def line_of(comment: str) -> int:
     return next(number for number, text in enumerate(lines, start=1) if comment in text)
 
 
-@pytest.mark.parametrize("case", CASES, ids="-".join)
-def test_exception_ends_the_run_and_names_method_file_and_line(laboratory: Laboratory, case):
-    side, method = case
+@pytest.mark.parametrize(("side", "method"), by_night(CASES, day=BY_DAY))
+def test_exception_ends_the_run_and_names_method_file_and_line(
+    laboratory: Laboratory, side, method
+):
     length = SHORT if method == "finish" else LONG
     run = laboratory.start(*length, faults={"side": side, "method": method})
 
@@ -68,7 +72,7 @@ def test_exception_in_a_submitted_job_ends_the_run_and_names_its_line(laboratory
     assert "Traceback (most recent call last)" in (run.directory / "host/log.jsonl").read_text()
 
 
-@pytest.mark.parametrize(("side", "method"), [("host", "receive"), ("agent", "step")])
+@pytest.mark.parametrize(("side", "method"), SIDES)
 def test_plugin_that_calls_exit_is_treated_as_one_that_raised(laboratory, side, method):
     run = laboratory.start(*LONG, faults={"side": side, "method": method, "action": "exit"})
 
@@ -90,7 +94,7 @@ def test_exception_in_one_agent_is_its_loss_if_the_policy_is_to_continue(laborat
     assert document["agents"]["lost"] == ["agent-02"]
 
 
-@pytest.mark.parametrize(("side", "method"), [("host", "receive"), ("agent", "step")])
+@pytest.mark.parametrize(("side", "method"), SIDES)
 def test_what_a_plugin_prints_is_kept_and_taken_for_no_event(laboratory, side, method):
     faults = {"side": side, "method": method, "action": "print", **AT_ONCE}
     run = laboratory.start(*SOME, faults=faults)
@@ -103,7 +107,10 @@ def test_what_a_plugin_prints_is_kept_and_taken_for_no_event(laboratory, side, m
 
 @pytest.mark.parametrize(
     ("max_miss_ratio", "code", "verdict"),
-    [("1e-3", 4, "CHECK BROKEN: deadline.miss_ratio"), ("0.99", 0, "PASSED: ")],
+    by_night(
+        [("1e-3", 4, "CHECK BROKEN: deadline.miss_ratio"), ("0.99", 0, "PASSED: ")],
+        day=[("1e-3", 4, "CHECK BROKEN: deadline.miss_ratio")],
+    ),
 )
 def test_step_of_50_ms_on_one_tick_costs_accounted_ticks(laboratory, max_miss_ratio, code, verdict):
     run = laboratory.start(

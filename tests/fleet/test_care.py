@@ -165,6 +165,7 @@ def test_reboot_waits_until_each_is_back(care: Care) -> None:
     }
 
 
+@pytest.mark.nightly
 def test_board_with_a_run_or_without_sudo_is_not_rebooted(care: Care) -> None:
     before = {name: care.boots(name) for name in NAMES}
     source = Path(madns_runtime.processes.__file__).read_text()
@@ -197,6 +198,7 @@ def test_board_with_a_run_or_without_sudo_is_not_rebooted(care: Care) -> None:
     assert (code, care.boots("pi01") - before["pi01"]) == (0, 1)
 
 
+@pytest.mark.nightly
 def test_board_that_does_not_come_back_in_time_failed(make_tower, tmp_path: Path) -> None:
     tower = make_tower(count=1, boot_delay_s=60.0)
 

@@ -80,6 +80,7 @@ def test_link_that_is_cut_in_the_midst_of_a_large_file_is_taken_up_again(tower8,
     assert not run.lies_on("pi01")
 
 
+@pytest.mark.nightly
 def test_link_that_comes_back_soon_is_not_even_an_error(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
     process = run.cosmos.start("collect")
@@ -166,6 +167,7 @@ def test_power_cut_ends_what_wrote_there_and_the_records_are_collected_afterward
     assert run.is_here()
 
 
+@pytest.mark.nightly
 def test_packets_that_are_lost_cost_time_alone(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES // 10)
     tower8.fault("pi01", "loss", 3)
@@ -202,6 +204,7 @@ def test_read_only_disk_of_a_board_gives_its_records_and_keeps_them(tower8, tmp_
     assert not run.lies_on("pi01")
 
 
+@pytest.mark.nightly
 def test_interrupted_collect_ends_at_once_and_is_taken_up_again(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2, noise_bytes=LARGE_BYTES)
     process = start_over_a_slow_link(run, tower8)

@@ -80,6 +80,7 @@ def operator(tmp_path_factory):
         yield operator
 
 
+@pytest.mark.nightly
 def test_board_whose_disk_fills_during_a_run_is_named_and_its_records_are_cut_where_they_end(
     operator,
 ):
@@ -127,6 +128,7 @@ def test_board_whose_card_fails_during_a_run_is_named_and_keeps_what_it_has(oper
     operator.tower.run("pi01", "rm -rf cosmos/runs/*", check=False)
 
 
+@pytest.mark.nightly
 def test_run_that_lost_the_power_of_everything_is_collected_afterwards(operator):
     process = operator.start("power", ENDLESS_S)
     time.sleep(3.0)

@@ -9,6 +9,7 @@ import threading
 import time
 
 import pytest
+from harness.nights import by_night
 from harness.wheel_cache import begin_cache
 from tower import BoardSpec
 from tower.roots import why_unavailable
@@ -178,7 +179,7 @@ CUTS = [
 """When the power is cut: so long after this question of its kind. Numpy comes in some 17 pieces."""
 
 
-@pytest.mark.parametrize(("verb", "number", "delay_s"), CUTS)
+@pytest.mark.parametrize(("verb", "number", "delay_s"), by_night(CUTS, day=CUTS[2::3]))
 def test_power_cut_at_any_point_leaves_nothing_half_and_is_repaired(tower, verb, number, delay_s):
     boots = tower.state()["boards"]["pi02"]["boots"]
     cutters = []
@@ -216,6 +217,7 @@ def test_what_was_said_to_be_there_survives_a_power_cut(tower):
     assert every_file.endswith(" []\n")
 
 
+@pytest.mark.nightly
 def test_full_disk_is_told_and_leaves_room_again(tower):
     tower.fault("pi04", "fill", 30_000)
 
@@ -240,6 +242,7 @@ def test_read_only_disk_is_told(tower):
     assert caught.value.kind is FailureKind.READ_ONLY
 
 
+@pytest.mark.nightly
 def test_cut_link_is_told_and_the_next_call_goes_on(tower):
     def cut(verb, count):
         if (verb, count) == ("wheel", 6):

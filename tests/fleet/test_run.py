@@ -100,6 +100,7 @@ def test_host_on_a_board_serves_boards_and_this_computer(tower: RunTower) -> Non
     assert (tower.directory / "host/events.jsonl").exists()
 
 
+@pytest.mark.nightly
 def test_detached_run_goes_on_on_boards_and_is_ended_by_its_number(tower: RunTower) -> None:
     tower.start("--detach", "--host", "pi01", time=ENDLESS, timeouts=PATIENT)
     assert tower.finish() == 0, tower.talk
@@ -178,6 +179,7 @@ def check_records(tower: RunTower) -> None:
     assert len(list((tower.directory / "agents").glob("*/ticks.jsonl"))) == 6
 
 
+@pytest.mark.nightly
 def test_power_cut_ends_the_run_by_name_and_says_what_is_missing(tower: RunTower) -> None:
     tower.start()
     tower.wait_until_running()
@@ -224,6 +226,7 @@ def test_board_that_returns_is_given_its_agents_again(tower: RunTower, fault: st
     assert streams[0] == "ticks.2.jsonl" or streams[0] == "ticks.3.jsonl"
 
 
+@pytest.mark.nightly
 def test_lost_packets_cost_no_message_that_must_arrive(tower: RunTower) -> None:
     for name in ("pi01", "pi02", "pi03"):
         tower.tower.fault(name, "udploss", 5)
@@ -253,6 +256,7 @@ def test_board_with_a_read_only_disk_is_named_and_nothing_is_started(tower: RunT
     assert "Read-only file system" in tower.talk
 
 
+@pytest.mark.nightly
 def test_second_ctrl_c_does_not_wait_for_a_board_that_does_not_answer(tower: RunTower) -> None:
     tower.start()
     tower.wait_until_running()

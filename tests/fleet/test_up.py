@@ -135,6 +135,7 @@ def test_settings_are_made_and_put_back(fleet):
     assert fleet.up().document["changed"] == 0
 
 
+@pytest.mark.nightly
 def test_settings_are_made_again_after_a_restart(fleet):
     fleet.write(boards=["pi01"], **SETTINGS)
     fleet.up()
@@ -192,6 +193,7 @@ def test_each_machine_that_cannot_be_made_ready_says_why_and_the_others_are(flee
     assert fleet.up().document["changed"] == 0
 
 
+@pytest.mark.nightly
 def test_slow_sudo_is_waited_for_and_forbidden_sudo_is_not_asked(fleet):
     fleet.tower.fault("pi01", "slow-sudo", 2)
     fleet.write(
@@ -242,6 +244,7 @@ def test_old_python_and_no_python_are_told_with_their_cure(own_fleet):
     )
 
 
+@pytest.mark.nightly
 def test_whatever_happens_in_the_midst_the_next_up_repairs(fleet):
     tower = fleet.tower
     names = list(tower.boards)
@@ -344,6 +347,7 @@ def test_edited_scenarios_are_sent_and_old_ones_pruned_once(fleet, tmp_path):
     assert again == []
 
 
+@pytest.mark.nightly
 def test_interrupted_command_leaves_what_the_next_one_finishes(fleet):
     fleet.write(boards=["pi01"], cosmos_provision=[PAUSE])
     process = fleet.start("--json")

@@ -93,6 +93,7 @@ def test_flood_is_taken_in_bounded_pieces(image):
     assert flood.count(b"FLOODFLOODFLOOD\n") == 20_000
 
 
+@pytest.mark.nightly
 def test_what_a_flood_brings_beyond_the_lines_rate_is_lost_and_counted(image):
     counts = Counter()
     with opened("emulated_mcu", firmware=image, line_bytes_s=4096) as mcu:

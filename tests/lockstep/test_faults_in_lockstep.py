@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from harness.nights import by_night
 
 from madns_runtime.conditions.condition import Condition, ValueBounds
 from madns_runtime.timeline.entries import ScheduledEntry
@@ -130,7 +131,7 @@ def returns_after_s(run):
     return next(e["returns_after_s"] for e in events if e["event"] == "killed")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", by_night(KINDS, day=[*KINDS][::3]))
 def test_a_run_with_a_fault_survives_it_and_repeats_to_the_bit(run_faults, kind):
     runs = [run_faults(*KINDS[kind], per_process=number) for number in (2, 6)]
     results = [run.result() for run in runs]

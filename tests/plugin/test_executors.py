@@ -316,6 +316,7 @@ def test_a_scheduler_without_workers_is_told_in_time(monkeypatch):
         connected(empty)
 
 
+@pytest.mark.nightly
 def test_workers_with_another_version_are_refused(cluster, monkeypatch):
     monkeypatch.setattr(dask_executor.madns_runtime, "__version__", "9.9")
     with pytest.raises(ConfigurationError, match=r"expected cosmos-madns 9\.9 .*, got 0\."):
@@ -362,6 +363,7 @@ def test_jobs_from_a_file_beside_the_scenario_are_refused_before_they_travel(clu
     executor.shutdown()
 
 
+@pytest.mark.nightly
 def test_workers_of_our_own_cluster_die_with_a_killed_host(tmp_path):
     script = tmp_path / "host.py"
     script.write_text(

@@ -264,6 +264,7 @@ with Retrieval(run, options=None, connections={t.name: LocalConnection(t) for t 
 """
 
 
+@pytest.mark.nightly
 def test_operator_that_is_killed_at_any_moment_can_go_on(tmp_path):
     for delay_s in (0.05, 0.15, 0.25, 0.35, 0.5):
         split = large_run(tmp_path / str(delay_s))

@@ -14,6 +14,7 @@ from types import FrameType
 from typing import Any
 
 import pytest
+from harness.nights import by_night
 
 from cosmos_cli import app
 from cosmos_cli.errors import FAULTS_SHOWN_MAX, Fault, InputError
@@ -105,13 +106,13 @@ def check_growth(load: Callable[[Path], Any], path: Path, make: Callable[[int], 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", list(SCENARIOS))
+@pytest.mark.parametrize("kind", by_night(SCENARIOS, day=[*SCENARIOS][2::3]))
 def test_work_grows_as_a_faulty_scenario_does(tmp_path, kind):
     check_growth(load_scenario, tmp_path / "a.yaml", SCENARIOS[kind])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", list(INVENTORIES))
+@pytest.mark.parametrize("kind", by_night(INVENTORIES, day=[*INVENTORIES][::3]))
 def test_work_grows_as_a_faulty_inventory_does(tmp_path, kind):
     check_growth(read_inventory, tmp_path / "a.yaml", INVENTORIES[kind])
 

@@ -413,6 +413,7 @@ def test_failure_is_remembered_for_the_other_machines_of_a_command(index, no_pro
     assert first is refused(PI, ["nosuchthing"])
 
 
+@pytest.mark.nightly
 def test_32_bit_arm_takes_from_its_distribution_what_has_no_wheel(index):
     make_wheel(index, "orjson", tag="cp311-cp311-manylinux_2_17_armv7l")
     make_wheel(index, "navlib", requires=["numpy>=1.20"])
@@ -532,6 +533,7 @@ def test_pips_own_files_are_read(tmp_path, monkeypatch):
     assert settings["cert"] == "/etc/own.pem"
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("platform", [PI, LAPTOP])
 def test_real_index_has_all_that_the_runtime_needs(platform, tmp_path, monkeypatch):
     monkeypatch.setenv("COSMOS_CACHE", str(tmp_path))
@@ -544,6 +546,7 @@ def test_real_index_has_all_that_the_runtime_needs(platform, tmp_path, monkeypat
     assert environment.distribution_packages == ()
 
 
+@pytest.mark.nightly
 def test_real_index_has_no_wheel_of_some_hardware_packages(tmp_path, monkeypatch):
     monkeypatch.setenv("COSMOS_CACHE", str(tmp_path))
     for requirement in ("RPi.GPIO", "RTIMULib"):

@@ -505,6 +505,7 @@ def test_played_samples_have_the_recorded_values_times_and_ages(braked):
             assert abs(played[2] - recorded[2]) <= 1
 
 
+@pytest.mark.nightly
 @needs_emulator
 def test_a_flight_computer_is_played_back_without_its_emulator(tmp_path):
     text = (SCENARIOS / "hwil_detumble.yaml").read_text()

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from harness.nights import by_night
 from harness.synthetic_run import SyntheticRun
 
 from cosmos_cli import app
@@ -81,7 +82,9 @@ TINY = "name: tiny\nsimulation: counter\nagents: {count: 1, tick_hz: 5}\ntime: {
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("redirection", [TO_NOBODY, f"{TO_NOBODY} 2>&1", ">&-"])
+@pytest.mark.parametrize(
+    "redirection", by_night([TO_NOBODY, f"{TO_NOBODY} 2>&1", ">&-"], day=[TO_NOBODY])
+)
 def test_tests_go_on_without_an_output_and_tell_by_their_file_and_code(
     tmp_path: Path, redirection: str
 ) -> None:
