@@ -6,6 +6,7 @@ import signal
 
 import pytest
 from harness.cosmos_command import LOOSE, CosmosCommand
+from harness.nights import by_night
 
 from madns_runtime.plugin.host_calls import FOLDER, PREFIX
 
@@ -150,6 +151,11 @@ FAULTS = [
 ]
 
 
+MODES = ["realtime", "lockstep"]
+REALTIME_BY_DAY = by_night(MODES, day=["realtime"])
+LOCKSTEP_BY_DAY = by_night(MODES, day=["lockstep"])
+
+
 def in_both_modes(faults):
     """Yield each fault in each mode: in one of them, by turns, every night alone."""
     for number, fault in enumerate(faults):
@@ -203,7 +209,7 @@ def test_an_agent_that_is_killed_in_a_call_is_told_with_the_call(tmp_path):
     assert re.search(told, result["reason"])
 
 
-@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+@pytest.mark.parametrize("mode", REALTIME_BY_DAY)
 def test_an_agent_that_is_killed_by_a_signal_without_a_name_costs_no_other(tmp_path, mode):
     result = run(tmp_path, "nameless", SOME, f"time.mode={mode}", "on_agent_loss=continue")
 
@@ -211,7 +217,7 @@ def test_an_agent_that_is_killed_by_a_signal_without_a_name_costs_no_other(tmp_p
     assert f"killed by signal {signal.SIGRTMIN + 1} in the " in json.dumps(result)
 
 
-@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+@pytest.mark.parametrize("mode", LOCKSTEP_BY_DAY)
 def test_a_host_that_ends_without_a_word_is_told_with_the_call(tmp_path, mode):
     result = run(tmp_path, "timer_exit", f"time.mode={mode}")
 
@@ -250,7 +256,7 @@ def is_own(path, tmp_path):
     return any(path.name.endswith(plan["session"]) for plan in plans)
 
 
-@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+@pytest.mark.parametrize("mode", REALTIME_BY_DAY)
 def test_the_timer_is_given_the_times_it_asked_for_however_late_it_is(tmp_path, mode):
     result = run(tmp_path, "nominal", f"time.mode={mode}")
     told = result["simulation"]["host"]
@@ -261,7 +267,7 @@ def test_the_timer_is_given_the_times_it_asked_for_however_late_it_is(tmp_path, 
     assert (told["late_s"] > 0.0) == (mode == "realtime")
 
 
-@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+@pytest.mark.parametrize("mode", LOCKSTEP_BY_DAY)
 def test_each_agent_is_given_its_own_initial_data_though_the_host_returns_one_mapping(
     tmp_path, mode
 ):
@@ -281,7 +287,7 @@ def test_broken_sync_deadline_breaks_its_check(tmp_path):
     assert result["exit_code"] == 4
 
 
-@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+@pytest.mark.parametrize("mode", REALTIME_BY_DAY)
 def test_a_half_that_hears_something_can_ask_for_its_timer(tmp_path, mode):
     result = run(tmp_path, "wake", f"time.mode={mode}", SOME)
 

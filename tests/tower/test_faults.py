@@ -11,7 +11,7 @@ import pytest
 from .faults import FAULTS
 from .tower import Tower, TowerError
 
-pytestmark = pytest.mark.root
+pytestmark = [pytest.mark.root, pytest.mark.nightly]
 
 SHORT_S = 2.0
 LOSS_PERCENT = 20

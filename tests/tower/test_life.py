@@ -23,7 +23,7 @@ from .places import TOWERS_MAX, Places
 from .specification import BoardSpec
 from .tower import Tower, TowerError, wait_until_gone
 
-pytestmark = pytest.mark.root
+pytestmark = [pytest.mark.root, pytest.mark.nightly]
 
 PATIENCE_S = 120.0
 ROOT = Path(__file__).parents[2]
