@@ -134,6 +134,7 @@ def test_cars_are_found_by_their_plates(cosmos, lockstep):
     }
 
 
+@pytest.mark.nightly
 @pytest.mark.process
 def test_cars_drive_in_real_time_too_and_record_what_they_declare(cosmos):
     settings = [

@@ -62,6 +62,7 @@ def test_a_biased_receiver_measures_beside_the_truth_which_stays_as_it_was(cosmo
     assert {by_m for t_s, by_m in moved.items() if not 20 <= t_s < 40} == {0.0}
 
 
+@pytest.mark.nightly
 def test_a_receiver_stays_biased_over_a_restart_of_its_agent_until_its_end(cosmos, tmp_path):
     fault = {"action": "sensor_fault", "sensor": "gnss", "fault": "biased", "bias": [500.0]}
     both = ["agent-01", "agent-02"]
@@ -152,6 +153,7 @@ def named(path):
     return [dict(zip(names, line, strict=True)) for line in lines if isinstance(line, list)]
 
 
+@pytest.mark.nightly
 def test_failures_of_radio_repeat_to_the_bit_and_break_nothing(passes):
     _, results, codes = passes
 

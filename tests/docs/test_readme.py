@@ -31,6 +31,7 @@ def test_tutorial_runs_from_its_first_command_to_its_last(tmp_path):
     assert "rover" in done.stdout
 
 
+@pytest.mark.nightly
 def test_tutorials_broken_rover_fails_its_check_with_code_4(tmp_path):
     assert run("cosmos init rover --template plugin --directory rover", tmp_path).returncode == 0
     program = tmp_path / "rover" / "rover.py"

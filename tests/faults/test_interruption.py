@@ -126,6 +126,7 @@ def test_ps_lists_a_run_and_down_ends_it_cleanly(laboratory):
     assert "no run lives" in laboratory.cosmos("ps").stderr
 
 
+@pytest.mark.nightly
 def test_down_ends_a_run_whose_operator_hangs(laboratory):
     run = started(laboratory)
     run.signal(signal.SIGSTOP)
@@ -162,6 +163,7 @@ def test_agent_started_by_hand_joins_the_run(laboratory):
     assert laboratory.leftovers() == []
 
 
+@pytest.mark.nightly
 def test_hand_started_agent_that_is_killed_is_lost(laboratory):
     # Nobody but the host can notice it.
     run = laboratory.start(*LONG, "--manual", "agent-02", "--set", "timeouts.silence_s=5")
@@ -172,6 +174,7 @@ def test_hand_started_agent_that_is_killed_is_lost(laboratory):
         check_ending(run, 1, "failed", "FAILED: agent-02: ")
 
 
+@pytest.mark.nightly
 def test_ctrl_c_on_a_terminal_of_its_own_ends_an_agent_started_by_hand(laboratory):
     run = laboratory.start(*LONG, "--manual", "agent-02")
     with start_by_hand(run) as by_hand:

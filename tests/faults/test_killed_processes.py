@@ -160,6 +160,7 @@ def test_killed_host_ends_the_run_and_what_is_there_can_be_collected(laboratory)
     check_evidence(run.directory, run.document)
 
 
+@pytest.mark.nightly
 def test_agents_of_a_killed_host_end_by_themselves_with_their_records_closed(laboratory):
     run = laboratory.start(*LONG, "--set", "timeouts.silence_s=5")
     run.wait_until_running()
@@ -246,6 +247,7 @@ def test_plugin_that_is_still_being_imported_does_not_survive_a_killed_operator(
     wait_until_ended(laboratory)
 
 
+@pytest.mark.nightly
 def test_collect_refuses_a_run_that_still_lives(laboratory):
     run = laboratory.start(*LONG)
     run.wait_until_running(0.0)

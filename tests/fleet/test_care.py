@@ -151,6 +151,7 @@ def test_machine_that_cannot_be_asked_hides_nobody(care: Care) -> None:
     assert findings(answer, "pi01")["udp"] in ("ok", "warning")  # as above
 
 
+@pytest.mark.nightly
 def test_reboot_waits_until_each_is_back(care: Care) -> None:
     before = {name: care.boots(name) for name in NAMES}
 
@@ -253,6 +254,7 @@ def test_troubles_of_apt_are_told_in_words(care: Care) -> None:
     assert "`requirements` of the scenario" in answer["machines"][0]["failure"]["advice"]
 
 
+@pytest.mark.nightly
 def test_apt_of_somebody_else_is_waited_for(care: Care) -> None:
     hold = "import fcntl,time; f=open('/var/lib/dpkg/lock-frontend','w'); fcntl.lockf(f,2); print(1,flush=True); time.sleep(4)"
     care.tower.run("pi01", "sudo apt-get update")

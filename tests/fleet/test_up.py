@@ -113,6 +113,7 @@ def test_check_shows_the_plan_and_changes_nothing(fleet):
     assert done.changes("pi01") == planned.changes("pi01")
 
 
+@pytest.mark.nightly
 def test_settings_are_made_and_put_back(fleet):
     fleet.write(boards=["pi01"])
     fleet.up()

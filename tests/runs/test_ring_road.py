@@ -133,6 +133,7 @@ def test_the_same_seed_gives_the_same_records_and_another_gives_others(in_lockst
     assert first["between_agents"] == again["between_agents"]
 
 
+@pytest.mark.nightly
 def test_in_real_time_the_account_is_as_exact(in_lockstep, tmp_path):
     due, _ = in_lockstep
     result, evidence = run(tmp_path / "realtime", "time.mode=realtime")

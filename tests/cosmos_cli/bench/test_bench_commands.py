@@ -156,6 +156,7 @@ OF_A_MOMENT = ("vars.trip_ms_max=60000", "vars.sd_ms_max=60000", "vars.trips_hz_
 """What a second of round trips comes to says nothing on a busy machine."""
 
 
+@pytest.mark.nightly
 def test_suite_runs_shortest_first_and_tells_round_trips_of_both_ends(command):
     files = [SCENARIOS / "thesis" / f"benchmark_{name}.yaml" for name in ("6min", "3min")]
     done = command(
@@ -249,6 +250,7 @@ def test_capacity_tries_runs_and_sets_the_plan_beside(command):
     assert "trial 2: 2 agents at 20 Hz for 1 s" in done.stderr
 
 
+@pytest.mark.nightly
 def test_interrupted_capacity_leaves_its_table_and_nothing_running(command):
     done = command.start(
         *("bench", "capacity", "--hz", "20", "--max-miss-ratio", "1", "--seconds", "1"),

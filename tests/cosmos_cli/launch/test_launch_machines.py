@@ -290,6 +290,7 @@ def test_lost_machine_ends_the_run_and_its_evidence_is_collected_when_it_answers
     assert (fleet.directory / "agents" / "agent-01" / "ticks.jsonl").exists()
 
 
+@pytest.mark.nightly
 def test_frozen_supervisor_is_lost_and_does_not_outlive_the_run(fleet: Fleet) -> None:
     fleet.start(**LOSING)
     fleet.wait_until_running()
@@ -334,6 +335,7 @@ def test_machine_that_returns_is_given_its_agents_again(fleet: Fleet, how: str) 
     ]
 
 
+@pytest.mark.nightly
 @needs_emulator
 def test_flight_computer_of_a_board_that_was_lost_is_started_anew_with_it(fleet: Fleet) -> None:
     changes = emulated_flight(fleet.folder, "agent-01", "agent-03", count=4, duration_s=600)
@@ -399,6 +401,7 @@ def test_detached_run_is_seen_and_ended_from_another_folder(fleet: Fleet, tmp_pa
     assert fleet.document["status"] == "interrupted"
 
 
+@pytest.mark.nightly
 def test_machine_that_does_not_answer_is_named_by_ps_and_down(fleet: Fleet) -> None:
     fleet.start("--detach")
     assert fleet.finish() == 0
@@ -414,6 +417,7 @@ def test_machine_that_does_not_answer_is_named_by_ps_and_down(fleet: Fleet) -> N
     assert "0001-tiny: pi02: failed: no answer" in ended.stdout
 
 
+@pytest.mark.nightly
 def test_inventory_finds_a_run_of_which_this_user_knows_nothing(fleet: Fleet) -> None:
     fleet.start("--detach", "--host", "pi01")
     assert fleet.finish() == 0
@@ -478,6 +482,7 @@ def test_ctrl_c_ends_all_machines_cleanly(fleet: Fleet) -> None:
     assert fleet.document["data"]["missing"] == []
 
 
+@pytest.mark.nightly
 def test_second_ctrl_c_kills_on_all_machines_and_leaves_their_records_for_later(
     fleet: Fleet,
 ) -> None:

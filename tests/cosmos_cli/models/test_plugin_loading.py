@@ -184,6 +184,7 @@ def test_lockstep_names_the_line_as_well(answer):
     assert (code, "odd.py" in words, "it was not done within 2 s" in words) == (1, True, True)
 
 
+@pytest.mark.nightly
 def test_flight_software_is_held_to_the_same(answer, tmp_path):
     (tmp_path / "odd.py").write_text("while True: pass\nclass Flight: pass\n")
     (tmp_path / "one.tle").write_text(ONE_TLE)

@@ -137,6 +137,7 @@ def test_machines_own_requirements_and_packages_count(machine, index, scenario):
     assert environment.key in ready(machine, scenario, machine=entry).python
 
 
+@pytest.mark.nightly
 def test_host_machine_needs_more(machine, index, scenario):
     installed(machine, "navlib")
     with pytest.raises(MachineFailure):
