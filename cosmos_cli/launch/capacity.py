@@ -185,13 +185,13 @@ class _ProcessorLoad:
 
     @property
     def batches_s(self) -> float:
-        """What the host's workers compute for an agent's batches, s per second, at speed 1."""
+        """Processor time of the host's workers for an agent's batches, s per second, at speed 1."""
         demand = self.demand
         return demand.batch_compute_s / demand.buffer_s if demand.buffer_s > 0.0 else 0.0
 
     @property
     def maneuvers_s(self) -> float:
-        """What they compute for an agent's maneuvers over a long time, s per second, at speed 1."""
+        """The same for an agent's maneuvers over a long time."""
         return self.demand.sync_rate_hz * self.demand.sync_compute_s
 
     def host_loop(self) -> Limit:
