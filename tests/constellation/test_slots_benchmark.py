@@ -70,6 +70,7 @@ def test_scenarios_start_as_bad_as_they_say_and_without_the_dead(benchmark):
     assert sorted(set(range(93)) - set(gap.indices)) == [45, 46]
 
 
+@pytest.mark.nightly
 def test_command_of_the_guide_measures_all_three(tmp_path):
     guide = (ROOT / "docs/control.md").read_text("utf-8")
     command = ["benchmarks/slots.py", "scenarios/chain77.yaml"]

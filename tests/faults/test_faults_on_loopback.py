@@ -88,6 +88,7 @@ def test_processes_that_are_killed_on_purpose_return_and_cost_no_verdict(laborat
     assert result["messages"]["reliable"]["lost"] == result["messages"]["sync"]["lost"] == 0
 
 
+@pytest.mark.nightly
 def test_an_end_on_purpose_takes_no_return_from_an_agent_that_fails_later(laboratory):
     (laboratory.folder / "acting.py").write_text(ACTING)
     back = {"stream": "events", "agents": ["host"], "field": "event", "equals": "agent_rejoined"}
@@ -182,6 +183,7 @@ def test_of_a_process_that_others_share_only_the_half_is_dropped_and_it_returns_
     assert result["faults"]["between_agents"]["lost"] > 0
 
 
+@pytest.mark.nightly
 def test_a_loss_that_nobody_ordered_is_judged_beside_one_that_was(laboratory):
     result, _ = run_faults(
         laboratory,

@@ -8,6 +8,7 @@ import time
 
 import pytest
 from fault_harness import SCENARIO, Laboratory, Run, check_ending
+from harness.nights import by_night
 
 from madns_runtime.recording.reader import read_stream
 
@@ -31,7 +32,10 @@ def freeze(laboratory: Laboratory, *arguments: str) -> tuple[Run, int]:
 
 @pytest.mark.parametrize(
     ("max_miss_ratio", "code", "verdict"),
-    [("1e-3", 4, "CHECK BROKEN: deadline.miss_ratio"), ("0.9", 0, "PASSED: ")],
+    by_night(
+        [("1e-3", 4, "CHECK BROKEN: deadline.miss_ratio"), ("0.9", 0, "PASSED: ")],
+        day=[("0.9", 0, "PASSED: ")],
+    ),
 )
 def test_shortly_frozen_agent_costs_its_missed_ticks_only(
     laboratory, max_miss_ratio, code, verdict
@@ -50,6 +54,7 @@ def test_shortly_frozen_agent_costs_its_missed_ticks_only(
     assert document["timing"]["missed"] >= ticks["missed"]
 
 
+@pytest.mark.nightly
 def test_agent_frozen_past_its_deadline_aborts_the_run_and_closes_its_records_when_thawed(
     laboratory,
 ):
@@ -64,6 +69,7 @@ def test_agent_frozen_past_its_deadline_aborts_the_run_and_closes_its_records_wh
     assert f"agent-02: {LOST}" in events
 
 
+@pytest.mark.nightly
 def test_agent_that_stays_frozen_is_killed_and_named(laboratory):
     run, _ = freeze(laboratory, *SILENCE, *LONG, "--set", "timeouts.shutdown_s=10")
 
@@ -77,6 +83,7 @@ def test_agent_that_stays_frozen_is_killed_and_named(laboratory):
     assert [line.split(":")[0] for line in document["data"]["missing"]] == ["agent-02"]
 
 
+@pytest.mark.nightly
 def test_thawed_agent_is_expelled_and_the_others_complete(laboratory):
     run, pid = freeze(laboratory, *SILENCE, *LONG, "--set", "on_agent_loss=continue")
     run.wait_for(f"agent-02 is lost: {LOST}")

@@ -86,6 +86,7 @@ def test_boards_are_checked_made_ready_run_and_read(tower: RunTower) -> None:
     assert [machine["is_ready"] for machine in lost["machines"]] == [True, False]
 
 
+@pytest.mark.nightly
 def test_log_of_a_detached_run_is_followed_on_its_machines(tower: RunTower) -> None:
     tower.choose("pi01", "pi02")
     (tower.scenarios / "talkative.py").write_text(TALKATIVE.read_text())

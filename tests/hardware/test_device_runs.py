@@ -189,6 +189,7 @@ def levels_of(folder):
     return [json.loads(line)[-1] for line in whole]
 
 
+@pytest.mark.nightly
 def test_a_detached_run_takes_faults_and_ends_by_the_name_of_a_lost_device(tmp_path):
     scenario = write_scenario(tmp_path, "nothing", rate_hz=1)
     cosmos = CosmosCommand(tmp_path)

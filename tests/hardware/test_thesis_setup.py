@@ -57,6 +57,7 @@ def rows(folder):
     ]
 
 
+@pytest.mark.nightly
 def test_samples_of_a_stand_in_reach_the_host_with_their_delay(tmp_path):
     code, document, folder = run(tmp_path, STAND_IN)
 
@@ -77,6 +78,7 @@ def test_samples_of_a_stand_in_reach_the_host_with_their_delay(tmp_path):
     assert (folder / "devices" / "pi22" / "hat" / "gyroscope.jsonl").is_file()
 
 
+@pytest.mark.nightly
 def test_a_device_that_nobody_uses_breaks_a_check(tmp_path):
     code, document, _ = run(tmp_path, STAND_IN, "parameters.send_device=camera", "agents.count=22")
 

@@ -173,6 +173,7 @@ def test_firmware_that_stops_in_its_fault_handler_is_named_and_commands_no_more(
     assert_coasts(folder, BEGINS_S + 1.2, DURATION_S)
 
 
+@pytest.mark.nightly
 def test_emulator_that_gives_up_is_named_in_its_own_words(fly):
     code, folder, document = fly(lockup_at_s=BEGINS_S)
 

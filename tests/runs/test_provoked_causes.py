@@ -8,6 +8,7 @@ import json
 
 import pytest
 from harness.cosmos_command import LOOSE, CosmosCommand
+from harness.nights import by_night
 
 pytestmark = pytest.mark.process
 
@@ -82,7 +83,10 @@ def causes(tmp_path, agent, *settings):
     return document
 
 
-@pytest.mark.parametrize(("agent", "cause"), [("Stepping", "step"), ("Receiving", "receiving")])
+@pytest.mark.parametrize(
+    ("agent", "cause"),
+    by_night([("Stepping", "step"), ("Receiving", "receiving")], day=[("Stepping", "step")]),
+)
 def test_own_work_that_takes_too_long_is_named(tmp_path, agent, cause):
     document = causes(tmp_path, agent)
 

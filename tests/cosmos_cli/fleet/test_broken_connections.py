@@ -143,6 +143,7 @@ def test_run_goes_on_when_all_its_connections_break_again_and_again(
     check_whole(boards)
 
 
+@pytest.mark.nightly
 def test_agent_that_dies_while_the_connection_is_broken_is_told_afterwards(
     boards: BoardsOverSsh,
 ) -> None:
@@ -185,6 +186,7 @@ def test_connection_that_does_not_come_back_in_time_loses_the_machine(
     boards.wait_for(lambda: not boards.server.left("madns_runtime"), "end of what ran there")
 
 
+@pytest.mark.nightly
 def test_machine_whose_connection_comes_back_too_late_gets_its_agents_again(
     boards: BoardsOverSsh,
 ) -> None:

@@ -49,7 +49,7 @@ def files(tmp_path):
         ("exec", ["--", "true"]),
         ("doctor", []),
         ("wipe", ["--yes"]),
-        ("up", []),
+        pytest.param("up", [], marks=pytest.mark.nightly),
         ("ps", []),
     ],
 )

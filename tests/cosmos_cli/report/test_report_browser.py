@@ -176,6 +176,7 @@ def test_a_comparisons_figures_draw_too(tmp_path):
     assert "owned" not in found
 
 
+@pytest.mark.nightly
 def test_screenshot_is_taken_of_a_page_with_content(page):
     picture = page.parent / "report.png"
 
