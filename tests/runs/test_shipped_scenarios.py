@@ -10,7 +10,7 @@ from harness.cosmos_command import LOOSE, SCENARIOS, CosmosCommand
 pytestmark = pytest.mark.process
 
 QUICK_S = 1200.0
-NIGHT_S = 5400.0
+NIGHT_S = 4200.0
 SAME = "benchmark_1h or benchmark_6min or benchmark_8h or orbits_1h or orbits_4h or orbits_6min or guidance_4h"
 """A minute of these is the same as of what they extend."""
 REALTIME_MAX_S = 70
