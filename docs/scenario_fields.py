@@ -28,7 +28,6 @@ _WORDS = {
     "object": "mapping",
     "string": "text",
 }
-SIMULATIONS = {"constellation": "ConstellationParameters", "counter": "CounterParameters"}
 
 
 def with_fields(page: str) -> str:
@@ -48,9 +47,17 @@ def _tables(schema: Mapping[str, Any]) -> Iterator[str]:
         yield from _below(schema["properties"][key], definitions, told)
     yield "\n### Actions of a timeline\n\n"
     yield from _actions(schema["properties"]["timeline"]["items"], schema["$defs"]["TimelineRule"])
-    for name, definition in sorted(SIMULATIONS.items()):
+    for name, parameters in sorted(_simulations(schema)):
         yield f"\n## Parameters of {name}\n"
-        yield from _below({"$ref": f"#/$defs/{definition}"}, definitions, told)
+        yield from _below(parameters, definitions, told)
+
+
+def _simulations(schema: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the names of simulations and the schemas of their parameters."""
+    for each in schema["allOf"]:
+        named = each["if"].get("properties", {}).get("simulation")
+        if named is not None:
+            yield named["const"], each["then"]["properties"]["parameters"]
 
 
 def _below(schema: Any, definitions: Mapping[str, Any], told: set[str]) -> Iterator[str]:

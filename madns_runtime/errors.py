@@ -16,14 +16,21 @@ class PluginError(MadnsError):
 
 
 class MissingExtraError(MadnsError):
-    """An optional dependency is not installed; the message names the command that installs it."""
+    """
+    An optional dependency is not installed; the message names the command that installs it.
 
-    def __init__(self, module: str, extra: str) -> None:
+    Args:
+        module: What is missing.
+        extra: Extra that brings it.
+        distribution: Whose extra that is: a plug-in's own, or the runtime's.
+    """
+
+    def __init__(self, module: str, extra: str, distribution: str = "cosmos-madns") -> None:
         super().__init__(
-            f"{module} is not installed here; install it with: pip install 'cosmos-madns[{extra}]'"
+            f"{module} is not installed here; install it with: pip install '{distribution}[{extra}]'"
         )
         self.module = module
-        self.extra = extra
+        self.given = (module, extra, distribution)
 
 
 class BlamedError(PluginError):

@@ -84,7 +84,7 @@ _SPELLINGS: Final = {
     "*": " ",
 }
 _TERM: Final = re.compile(r"(?P<divided>/?)\s*(?P<symbol>[A-Za-z%][A-Za-z0-9]*?|[0-9.]+(?:e-?[0-9]+)?)"
-                          r"(?:\^?(?P<power>-?[0-9]))?(?=[\s/]|$)\s*")  # fmt: skip
+                          r"(?:\^?(?P<power>-?[1-9]))?(?=[\s/]|$)\s*")  # fmt: skip
 UNIT_CHARACTERS_MAX: Final = 40
 
 

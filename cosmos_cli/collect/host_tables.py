@@ -121,7 +121,7 @@ def write_host_table(
         try:
             written = _write_here(run, config, wanted, lambda _what, _share: None, tell)
         except MissingExtraError as error:
-            return {"missing": [error.module, error.extra]}
+            return {"missing": error.given}
         except (InputError, MadnsError) as error:
             return {"raised": [type(error).__name__, str(error)]}
         return {"written": [written.rows, written.gaps]}

@@ -236,7 +236,9 @@ class _ProcessorLoad:
 
     def maneuvers(self, at_once: int | None) -> Limit:
         """Return the limit of maneuvers of one instant: their truth within the lead, by what ticks leave of the host's processors."""
-        host, demand = self.host, self.demand
+        host, demand, name = self.host, self.demand, "maneuvers of one instant"
+        if not has_maneuvers(demand):
+            return Limit(name=name, agents=math.inf, why="none is commanded")
 
         def fits(agents: int) -> bool:
             ticks = self.used_s(agents, host) / host.speed
@@ -246,8 +248,8 @@ class _ProcessorLoad:
 
         count = "one of each agent" if at_once is None else f"{at_once} at most"
         return Limit(
-            name="maneuvers of one instant",
-            agents=largest(fits) if has_maneuvers(demand) else math.inf,
+            name=name,
+            agents=largest(fits),
             why=f"{count} within {demand.lead_s:g} s, by what ticks leave of the host's processors",
         )
 

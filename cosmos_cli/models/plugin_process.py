@@ -41,7 +41,7 @@ def ask_apart(work: Callable[[Tell], T], kind: type[T], document: Document, spec
         try:
             return {"value": to_mapping(work(tell))}
         except MissingExtraError as error:
-            return {"missing": [error.module, error.extra]}
+            return {"missing": error.given}
         except MadnsError as error:
             return {"raised": [type(error).__name__, str(error)]}
 

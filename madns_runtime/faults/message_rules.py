@@ -207,7 +207,7 @@ def _apply(
         case words.DUPLICATE:
             fate.is_doubled = fate.is_doubled or draw() < value["probability"]
         case _:
-            pass
+            raise ValueError(f"expected a fault of messages, got {rule.word!r}")
 
 
 def _resent_after_s(probability: float, draw: Callable[[], float], left_s: float) -> float:

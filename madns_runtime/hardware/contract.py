@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
 
-__all__ = ["Channel", "Device", "DeviceKind", "Needs", "Sample", "Value"]
+__all__ = ["Channel", "Device", "DeviceKind", "Needs", "Sample", "SimulatedDevice", "Value"]
 
 Value = float | Sequence[float] | bytes
 """Value of a channel: a number, a sequence of as many as its shape has, or the bytes of a frame."""

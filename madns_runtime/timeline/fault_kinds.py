@@ -22,7 +22,6 @@ LINK_DOWN: Final = "link_down"
 PARTITION: Final = "partition"
 
 LOSSES: Final = (KILL, RESTART)
-MESSAGE_FAULTS: Final = (LOSE, DELAY, REORDER, DUPLICATE, LINK_DOWN, PARTITION)
 
 Traffic = Literal["all", "with_host", "between_agents"]
 Probability = Annotated[float, Gt(0), Le(1)]
@@ -95,7 +94,7 @@ class DownLink:
     traffic: Traffic = "all"
 
 
-FAULT_KINDS: Final[tuple[ActionKind, ...]] = (
+_OF_AGENTS: Final[tuple[ActionKind, ...]] = (
     ActionKind(
         carried_out_by="framework",
         word=KILL,
@@ -117,6 +116,8 @@ FAULT_KINDS: Final[tuple[ActionKind, ...]] = (
         parameters=SlowSteps,
         lasting="may",
     ),
+)
+_OF_MESSAGES: Final[tuple[ActionKind, ...]] = (
     ActionKind(
         carried_out_by="framework",
         word=LOSE,
@@ -159,8 +160,11 @@ FAULT_KINDS: Final[tuple[ActionKind, ...]] = (
         lasting="may",
     ),
 )
+FAULT_KINDS: Final = (*_OF_AGENTS, *_OF_MESSAGES)
 """Every fault of agents and of their messages, by which `timeline:` and `cosmos inject` know it."""
 FAULT_WORDS: Final = tuple(kind.word for kind in FAULT_KINDS)
+MESSAGE_FAULTS: Final = tuple(kind.word for kind in _OF_MESSAGES)
+STEP_FAULTS: Final = tuple(kind.word for kind in _OF_AGENTS if kind.word not in LOSSES)
 
 
 def killed_words(action: TimelineAction) -> str:

@@ -18,6 +18,7 @@ from cosmos_cli import app
 from cosmos_cli.models.inventory.devices import MachineDevice
 from madns_runtime.config import HardwareSettings
 from madns_runtime.hardware import guardian, status
+from madns_runtime.hardware.contract import Channel, DeviceKind, Needs
 from madns_runtime.hardware.fault_actions import ACTIONS
 from madns_runtime.hardware.kind_registry import registered_kinds, resolve_kind
 from madns_runtime.simulations.constellation.equipment import Sensors
@@ -46,6 +47,27 @@ def written(folder):
     for text in scenarios:
         (folder / f"{text.split()[1]}.yaml").write_text(text)
     return [block.splitlines() for block in blocks(GUIDE, "sh")]
+
+
+def test_a_device_that_is_a_model_is_one_as_it_stands(tmp_path):
+    (text,) = (block for block in blocks(GUIDE, "python") if "class Swing" in block)
+    (tmp_path / "swing.py").write_text(text)
+
+    kind = resolve_kind("./swing.py:Swing", tmp_path)
+    values = [kind.device(None).sample_at(t_s).values["angle"] for t_s in (0.0, 0.5, 1.5)]
+
+    assert kind.follows_simulated_time
+    assert values == pytest.approx([0.0, 30.0, -30.0])
+
+
+@pytest.mark.parametrize("cls", [DeviceKind, Channel, Needs], ids=lambda cls: cls.__name__)
+def test_its_tables_name_all_that_a_kind_declares(cls):
+    table = GUIDE.split(f"\n| `{cls.__name__}` |")[1].split("\n\n")[0]
+    rows = re.findall(r"^\| (`[^|]*`) \|", table, flags=re.MULTILINE)
+
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == {
+        field.name for field in dataclasses.fields(cls)
+    }
 
 
 def test_kind_null_is_named_as_the_guide_writes_it(tmp_path, capsys):

@@ -8,7 +8,7 @@ import pytest
 from guides import ROOT, blocks
 from harness.cosmos_command import CosmosCommand
 
-from madns_runtime.plugin.api import Simulation
+from madns_runtime.plugin.api import Demand, Flow, Simulation, Tick
 
 GUIDE = (ROOT / "docs/plugins.md").read_text("utf-8")
 SCENARIO = """
@@ -25,6 +25,17 @@ def test_the_descriptor_has_a_line_for_each_field_of_a_simulation():
     assert set(re.findall(r"^    (\w+)=", shown, flags=re.M)) == {
         field.name for field in dataclasses.fields(Simulation)
     }
+
+
+def test_it_names_all_that_a_demand_and_a_tick_hold():
+    table = GUIDE.split("\n| `Demand` |")[1].split("\n\n")[0]
+    tick = GUIDE.split("\nA `Tick` has ")[1].split("\n\n")[0]
+    told = set(re.findall(r"`(\w+)`", table))
+
+    assert {field.name for cls in (Demand, Flow) for field in dataclasses.fields(cls)} == told - {
+        "Flow"
+    }
+    assert set(Tick._fields) == set(re.findall(r"`(\w+)`", tick))
 
 
 @pytest.mark.process

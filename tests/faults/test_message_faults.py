@@ -4,6 +4,7 @@ import itertools
 import math
 import random
 from collections import defaultdict
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import pytest
@@ -16,6 +17,13 @@ from madns_runtime.faults.step_faults import StepFaults
 from madns_runtime.medium.outcomes import DELIVERED, LOST, LinkOutcome
 from madns_runtime.protocol.messages import Service, Transmission
 from madns_runtime.timeline.action import ActionRefused, TimelineAction
+from madns_runtime.timeline.fault_kinds import (
+    FAULT_KINDS,
+    FAULT_WORDS,
+    LOSSES,
+    MESSAGE_FAULTS,
+    STEP_FAULTS,
+)
 
 AGENTS = ("a", "b", "c", "d")
 BEST, RELIABLE = Service.BEST, Service.RELIABLE
@@ -79,6 +87,32 @@ class Rig:
 
     def counts(self):
         return self.faults.to_mapping()["with_host"]
+
+
+def test_every_fault_is_of_agents_of_their_steps_or_of_messages():
+    assert sorted((*LOSSES, *STEP_FAULTS, *MESSAGE_FAULTS)) == sorted(FAULT_WORDS)
+
+
+@pytest.mark.parametrize("word", MESSAGE_FAULTS)
+def test_every_fault_of_messages_touches_some_between_agents(word):
+    (kind,) = (kind for kind in FAULT_KINDS if kind.word == word)
+    needed = {"delay_s": 1.0} if word == "delay_messages" else {}
+    rules = rules_of(rule(word, **asdict(kind.parameters(**needed))))
+
+    assert [n for n in range(20) if not rules.of_way("a", "b", n).is_plain] != []
+
+
+@pytest.mark.parametrize("word", STEP_FAULTS)
+def test_every_fault_of_steps_withholds_some(word):
+    faults = StepFaults()
+    faults.begin(1, word, 2.0)
+
+    assert any(faults.withholds(tick) for tick in range(4))
+
+
+def test_a_fault_of_messages_that_nobody_knows_how_to_insert_is_told():
+    with pytest.raises(ValueError, match="got 'squeeze_messages'"):
+        rules_of(rule("squeeze_messages")).of_way("a", "b", 1)
 
 
 def test_a_fifth_of_messages_is_lost_and_the_same_ones_under_the_same_seed():

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from madns_runtime.units import conversion, converted
+from madns_runtime import units
+from madns_runtime.units import conversion, converted, parse_unit
 
 
 @pytest.mark.parametrize(
@@ -63,3 +64,18 @@ def test_what_no_decimal_number_is_stays_the_product():
 )
 def test_what_does_not_convert_has_no_factor(unit, wanted):
     assert conversion(unit, wanted) is None
+
+
+def test_each_unit_of_the_tables_is_read_as_itself_and_no_prefix_makes_another_of_it():
+    named = units._PREFIXED | units._PLAIN
+
+    assert {name: parse_unit(name) for name in named} == named
+    assert [
+        p + name for p in units._PREFIXES for name in units._PREFIXED if p + name in named
+    ] == []
+    assert len(named) == len(units._PREFIXED) + len(units._PLAIN)
+
+
+@pytest.mark.parametrize("unit", ["m0", "m^0", "mg0"])
+def test_a_power_of_nought_is_no_unit(unit):
+    assert parse_unit(unit) is None

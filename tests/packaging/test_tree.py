@@ -1,6 +1,7 @@
 """What lies in the project's tree: the parts that it is known to have, written by hand, and nothing that a program left."""
 
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -34,3 +35,16 @@ def test_no_file_is_what_a_program_left(files):
     there = [path for path in files if (ROOT / path).is_file()]
     assert [str(path) for path in there if path.suffix in MADE_BY_PROGRAMS] == []
     assert [str(p) for p in there if (ROOT / p).stat().st_size > LARGEST_BYTES] == []
+
+
+@pytest.mark.parametrize(
+    ("group", "folder"),
+    [("madns.devices", "hardware/kinds"), ("madns.simulations", "simulations")],
+)
+def test_each_shipped_kind_of_device_and_each_simulation_has_its_line(group, folder):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    place = ROOT / "madns_runtime" / folder
+    shipped = {path.stem for path in place.glob("*.py")} - {"__init__"}
+    shipped |= {path.parent.name for path in place.glob("*/__init__.py")}
+
+    assert set(project["entry-points"][group]) == shipped

@@ -11,7 +11,7 @@ from madns_runtime.recording.records import (
     HOST_EVENT_WORDS,
 )
 from madns_runtime.timeline.dispatcher import BEGAN, ENDED, REFUSED, RESUMED
-from madns_runtime.timeline.fault_kinds import HANG, SLOW
+from madns_runtime.timeline.fault_kinds import STEP_FAULTS
 
 
 def test_all_words_of_events_are_known_and_no_others():
@@ -23,7 +23,7 @@ def test_all_words_of_events_are_known_and_no_others():
             continue  # devices have events of their own
         written.update(re.findall(r"(?:journal|self)\.event\(\s*\"(\w+)\"", text))
     written.update((BEGAN, ENDED, REFUSED, RESUMED))
-    written.update(f"{word}_{what}" for word in (HANG, SLOW) for what in ("begins", "ends"))
+    written.update(f"{word}_{what}" for word in STEP_FAULTS for what in ("begins", "ends"))
 
     assert set(EVENT_WORDS) == written
     assert len(EVENT_WORDS) == len(written)

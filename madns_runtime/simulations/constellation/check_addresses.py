@@ -11,13 +11,15 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, assert_never
 
 from madns_runtime.simulations.constellation.interface_settings import (
     SOCKET_PATH_BYTES_MAX,
     AnyTransport,
     DeviceTransport,
+    PtyTransport,
     SerialTransport,
+    StdioTransport,
     TcpTransport,
     UdpTransport,
     UnixTransport,
@@ -83,18 +85,23 @@ def _first(faults: Iterator[Iterator[str]]) -> Iterator[str]:
 
 def _addresses(transport: AnyTransport) -> Iterator[tuple[str, str]]:
     """Yield names and values of a transport's addresses."""
-    if isinstance(transport, TcpTransport):
-        yield "address", transport.address
-    elif isinstance(transport, UdpTransport):
-        yield "local", transport.local
-        if transport.remote is not None:
-            yield "remote", transport.remote
-    elif isinstance(transport, UnixTransport):
-        yield "path", transport.path
-    elif isinstance(transport, SerialTransport):
-        yield "port", transport.port
-    elif isinstance(transport, DeviceTransport):
-        yield "device", transport.device
+    match transport:
+        case TcpTransport():
+            yield "address", transport.address
+        case UdpTransport():
+            yield "local", transport.local
+            if transport.remote is not None:
+                yield "remote", transport.remote
+        case UnixTransport():
+            yield "path", transport.path
+        case SerialTransport():
+            yield "port", transport.port
+        case DeviceTransport():
+            yield "device", transport.device
+        case StdioTransport() | PtyTransport():
+            pass
+        case _:
+            assert_never(transport)
 
 
 def _faults(

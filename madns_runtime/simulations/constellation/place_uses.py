@@ -9,12 +9,16 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Iterator
 from pathlib import Path
+from typing import assert_never
 
 from madns_runtime.plugin.api import PlaceUse
 from madns_runtime.simulations.constellation.flight_settings import FlightClass, FlightRule
 from madns_runtime.simulations.constellation.interface_settings import (
+    DeviceTransport,
     FlightInterface,
+    PtyTransport,
     SerialTransport,
+    StdioTransport,
     TcpTransport,
     UdpTransport,
     UnixTransport,
@@ -83,17 +87,23 @@ def _taken(
 ) -> tuple[str, str, str] | None:
     """Return the transport's field, what kind of place it names, and which; None if others may have it, too."""
     transport = interface.transport
-    if isinstance(transport, SerialTransport):
-        return "port", "serial port", substitute(transport.port, values)
-    if isinstance(transport, TcpTransport) and transport.listen:
-        address = _plain(substitute(transport.address, values))
-        return ("address", "TCP port", address) if _port(address) != "0" else None
-    if isinstance(transport, UdpTransport):
-        address = _plain(substitute(transport.local, values))
-        return ("local", "UDP port", address) if _port(address) != "0" else None
-    if isinstance(transport, UnixTransport) and transport.listen:
-        return "path", "socket", str(Path(base_directory) / substitute(transport.path, values))
-    return None
+    match transport:
+        case SerialTransport():
+            return "port", "serial port", substitute(transport.port, values)
+        case TcpTransport():
+            address = _plain(substitute(transport.address, values))
+            is_taken = transport.listen and _port(address) != "0"
+            return ("address", "TCP port", address) if is_taken else None
+        case UdpTransport():
+            address = _plain(substitute(transport.local, values))
+            return ("local", "UDP port", address) if _port(address) != "0" else None
+        case UnixTransport():
+            path = str(Path(base_directory) / substitute(transport.path, values))
+            return ("path", "socket", path) if transport.listen else None
+        case StdioTransport() | PtyTransport() | DeviceTransport():
+            return None
+        case _:
+            assert_never(transport)
 
 
 def _plain(address: str) -> str:

@@ -285,14 +285,15 @@ OF_AGENTS = {
     "magnetometer": (*SAMPLE, Field("bx_t", "T"), Field("by_t", "T"), Field("bz_t", "T")),
 }
 SENSOR_STREAMS = (
-    "gyro",
     "gnss",
+    "gyro",
     "accelerometer",
+    "magnetometer",
     "star_tracker",
     "sun_sensor",
     "clock_sensor",
-    "magnetometer",
 )
+"""Streams of sensors, in the order of a report."""
 OF_AGENTS |= {
     f"{name}_{beside}": OF_AGENTS[name] for name in SENSOR_STREAMS for beside in ("truth", "model")
 }

@@ -93,6 +93,7 @@ def test_maneuvers_of_one_instant_have_what_ticks_leave_of_the_hosts_processors(
     assert limit(predicted(demand=asked, hz=1), name) == 1000
     assert limit(predicted(demand=asked, workers=2, maneuvers_at_once=10), name) == 79
     assert limit(predicted(), name) == math.inf
+    assert [each.why for each in predicted().limits if each.name == name] == ["none is commanded"]
 
 
 def test_a_burst_must_fit_the_granted_buffer():

@@ -36,6 +36,7 @@ from madns_runtime.simulations.constellation.analysis.orbits import (
 )
 from madns_runtime.simulations.constellation.analysis.predictions import prediction_blocks
 from madns_runtime.simulations.constellation.analysis.slots import read_control
+from madns_runtime.simulations.constellation.streams import SENSOR_STREAMS
 
 
 def _sensor(table: RecordedTable, run: RecordedRun) -> list[Block]:
@@ -44,15 +45,6 @@ def _sensor(table: RecordedTable, run: RecordedRun) -> list[Block]:
 
 
 CONTROL = "Control"
-SENSORS = (
-    "gnss",
-    "gyro",
-    "accelerometer",
-    "magnetometer",
-    "star_tracker",
-    "sun_sensor",
-    "clock_sensor",
-)
 CHAPTERS = {
     "state": Chapter("Orbits", state_blocks),
     "elements": Chapter("Orbits", elements_blocks),
@@ -66,10 +58,10 @@ CHAPTERS = {
     "messages": Chapter("Links", message_blocks),
     "refusals": Chapter("Links", refusal_blocks),
     "host_contacts": Chapter("Links", contact_blocks),
-    **{name: Chapter("Sensors", _sensor) for name in SENSORS},
-    **{f"{name}_model": Chapter("Sensors", sensor_blocks) for name in SENSORS},
+    **{name: Chapter("Sensors", _sensor) for name in SENSOR_STREAMS},
+    **{f"{name}_model": Chapter("Sensors", sensor_blocks) for name in SENSOR_STREAMS},
     # Drawn as the errors of what stands beside it.
-    **{f"{name}_truth": Chapter("Sensors", lambda table, run: ()) for name in SENSORS},
+    **{f"{name}_truth": Chapter("Sensors", lambda table, run: ()) for name in SENSOR_STREAMS},
     "host_truth": Chapter("Truth on record", truth_blocks),
     "host_invariants": Chapter("Health of the model", invariants_blocks),
 }

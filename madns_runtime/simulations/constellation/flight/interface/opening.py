@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, assert_never
 
 from madns_runtime.errors import BlamedError, PluginError
 from madns_runtime.plugin.context import describe_exception
@@ -108,24 +108,28 @@ def make_transport(
         BlamedError: An address is none, or there is no such device.
     """
     given = interface.transport
-    if isinstance(given, settings.StdioTransport):
-        return StdioLink("stdio")
-    if isinstance(given, settings.PtyTransport):
-        return PtyLink("pty")
-    if isinstance(given, settings.SerialTransport):
-        return SerialLink(substitute(given.port, values), given.baud_rate)
-    if isinstance(given, settings.TcpTransport):
-        address = substitute(given.address, values)
-        family, place = resolve(address, socket.SOCK_STREAM, "transport.address")
-        return SocketLink(f"tcp {address}", family, place, listens=given.listen)
-    if isinstance(given, settings.UnixTransport):
-        path = socket_path(substitute(given.path, values), base_directory)
-        return SocketLink(f"unix {path}", socket.AF_UNIX, path, listens=given.listen)
-    if isinstance(given, settings.UdpTransport):
-        return _udp(given, values)
-    device = find_device(devices, substitute(given.device, values))
-    is_stream = interface.protocol in settings.PROTOCOLS
-    return DeviceLink(device, protocol=interface.protocol if is_stream else "")
+    match given:
+        case settings.StdioTransport():
+            return StdioLink("stdio")
+        case settings.PtyTransport():
+            return PtyLink("pty")
+        case settings.SerialTransport():
+            return SerialLink(substitute(given.port, values), given.baud_rate)
+        case settings.TcpTransport():
+            address = substitute(given.address, values)
+            family, place = resolve(address, socket.SOCK_STREAM, "transport.address")
+            return SocketLink(f"tcp {address}", family, place, listens=given.listen)
+        case settings.UnixTransport():
+            path = socket_path(substitute(given.path, values), base_directory)
+            return SocketLink(f"unix {path}", socket.AF_UNIX, path, listens=given.listen)
+        case settings.UdpTransport():
+            return _udp(given, values)
+        case settings.DeviceTransport():
+            device = find_device(devices, substitute(given.device, values))
+            is_stream = interface.protocol in settings.PROTOCOLS
+            return DeviceLink(device, protocol=interface.protocol if is_stream else "")
+        case _:
+            assert_never(given)
 
 
 def _udp(given: settings.UdpTransport, values: Mapping[str, str]) -> UdpLink:
