@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ TICK_TOLERANCE = 0.25
 SAME_TIME_S = 1e-6
 """Of ticks at different rates those are matched that mean the same instant, s."""
 IDENTITY = ("agent", "satellite", "sender", "to", "receiver", "station", "kind", "event")
-"""Text fields that tell whom or what a record is about; records match only where they agree."""
+"""Text fields that tell whom or what a record is about, whatever its stream: records match only where they agree."""
 TIMES = ("t_s", "commanded_s", "sent_s", "rise_s", "at_s")
 """Fields of a time, in the order in which they are tried."""
 PACKET = "packet"
@@ -149,6 +149,42 @@ def choose_pairing(a: Sequence[Field], b: Sequence[Field], tick_hz: tuple[float,
     return Pairing(by="order", column="", identity=())
 
 
+def tell_apart(a: Recorded, b: Recorded, pairing: Pairing) -> Pairing:
+    """
+    Return the pairing with the text fields besides that tell records of one time apart, such as a plug-in's `rover`.
+
+    The records show which: of the first piece of each run, fewer are alike with such a field.
+
+    Raises:
+        MachineError: A file cannot be read.
+    """
+    others = {(field.name, field.kind) for field in b.fields}
+    texts = [f.name for f in a.fields if f.kind == "str" and (f.name, f.kind) in others]
+    texts = [name for name in texts if name not in pairing.identity]
+    if pairing.by == "order" or not texts:
+        return pairing
+    names = (pairing.column, *pairing.identity, *texts)
+    pieces = [
+        next(iter(one.batches(names)), {name: np.empty(0) for name in names}) for one in (a, b)
+    ]
+
+    def alike(identity: tuple[str, ...]) -> int:
+        return sum(_repeated(piece, pairing.column, identity) for piece in pieces)
+
+    identity, left = pairing.identity, alike(pairing.identity)
+    for name in texts:
+        if left and (fewer := alike((*identity, name))) < left:
+            identity, left = (*identity, name), fewer
+    return replace(pairing, identity=identity)
+
+
+def _repeated(columns: Mapping[str, Any], key: str, identity: tuple[str, ...]) -> int:
+    """Return how many records another one precedes that is of the same time and about the same."""
+    keys = columns[key].tolist()
+    who = _who(columns, identity, len(keys)).tolist()
+    return len(keys) - len(set(zip(keys, who, strict=True)))
+
+
 def diff_stream(
     a: Recorded,
     b: Recorded,
@@ -168,6 +204,7 @@ def diff_stream(
     Raises:
         MachineError: A file cannot be read.
     """
+    pairing = tell_apart(a, b, pairing)
     try:
         return _diff(a, b, pairing, agents, None)
     except KeyWentBackError:
