@@ -37,7 +37,7 @@ TURNED = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 SUN_M = np.array(sun_m(days_since_j2000(datetime.fromisoformat(EPOCH))))
 SUN = SUN_M / np.linalg.norm(SUN_M)
 LIT = (*(7.158e6 * SUN), 0.0, 0.0, 0.0)
-UNTOUCHED = SimpleNamespace(ballistic_m2_kg=None, given_m_s=lambda t_s: (0.0, 0.0, 0.0))
+UNTOUCHED = SimpleNamespace(ballistic_m2_kg=None, given_m_s=lambda t_s: ((0.0,) * 3, (0.0,) * 3))
 """Neither thrust nor drag; what an accelerometer feels of them is in test_accelerometer.py."""
 RIGID = (*LEO, *TURNED, 0.001, -0.002, 0.003)
 
