@@ -37,6 +37,8 @@ class Instrument:
     channels: int = 3
     """Errors that a measurement needs."""
     stream: str = ""
+    is_unit: bool = False
+    """Whether its values are of length 1: a direction or a quaternion."""
     is_mean: bool = False
     """Whether it measures the mean since its measurement before, and not an instant."""
 
