@@ -35,9 +35,9 @@ from madns_runtime.simulations.constellation.truth.maneuvers.tank import (
 ARC_S = 5.0
 """Length of an arc: its direction is that of its middle, 0.15 deg from where it begins in LEO."""
 ARC_TURN_RAD = 0.3
-"""So far a body turns at most in one arc along its axes: what an arc gives then is 0.4 % more than the mean of a push that turns."""
+"""Most that a body turns in one arc along its axes: the arc gives 0.4 % more than the mean of a push that turns as far."""
 TURNED_ARC_S_MIN = 0.05
-"""No turning asks for shorter arcs."""
+"""Shortest arc that turning asks for, s."""
 AHEAD_S = 2.0
 """Before the end of an arc the next one is given."""
 STUCK_NUMBER_FIRST = 2**31
