@@ -45,6 +45,14 @@ def test_a_biased_sensor_adds_to_its_first_values_and_a_dead_one_gives_none():
     assert not failures
 
 
+def test_a_biased_direction_stays_one_and_none_is_left_where_the_bias_takes_all_of_it():
+    failures = SensorFailures(is_unit=True)
+    failures.begin(1, SensorFault(sensor="sun_sensor", fault="biased", bias=(0.0, 0.75)))
+
+    assert failures.altered((1.0, 0.0, 0.0)) == pytest.approx((0.8, 0.6, 0.0))
+    assert failures.altered((0.0, -0.75, 0.0)) is None
+
+
 def test_a_sensor_that_sticks_again_does_so_where_it_is_though_another_failure_outlasts_the_first():
     failures = SensorFailures()
     failures.begin(1, SensorFault(sensor="gyro", fault="stuck"))

@@ -84,6 +84,7 @@ def faults(folder, **rest):
                 }
             ]
         },
+        {"vehicles": [{"attitude": {"inertia_kg_m2": [0.1, 0.7, 0.8]}}]},
         {
             "propagator": {"kind": "scipy", "forces": ["two_body", "drag"]},
             "vehicles": [{"ballistic_m2_kg_range": [0.01, 0.02]}],

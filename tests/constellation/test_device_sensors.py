@@ -61,7 +61,7 @@ class GivenPushes:
     ballistic_m2_kg = None
 
     def given_m_s(self, t_s):
-        return (t_s, 0.0, 0.0)
+        return (0.0, 0.0, 0.0), (t_s, 0.0, 0.0)
 
 
 class Bench:

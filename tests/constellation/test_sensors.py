@@ -11,6 +11,7 @@ from constellation_fakes import FakeContext, parameters
 
 from madns_runtime.config import from_mapping
 from madns_runtime.plugin.api import Tick
+from madns_runtime.simulations.constellation.actions import SensorFault
 from madns_runtime.simulations.constellation.agent import ConstellationAgent
 from madns_runtime.simulations.constellation.equipment import Sensors
 from madns_runtime.simulations.constellation.messages import Initial, Segment
@@ -37,7 +38,7 @@ TURNED = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 SUN_M = np.array(sun_m(days_since_j2000(datetime.fromisoformat(EPOCH))))
 SUN = SUN_M / np.linalg.norm(SUN_M)
 LIT = (*(7.158e6 * SUN), 0.0, 0.0, 0.0)
-UNTOUCHED = SimpleNamespace(ballistic_m2_kg=None, given_m_s=lambda t_s: (0.0, 0.0, 0.0))
+UNTOUCHED = SimpleNamespace(ballistic_m2_kg=None, given_m_s=lambda t_s: ((0.0,) * 3, (0.0,) * 3))
 """Neither thrust nor drag; what an accelerometer feels of them is in test_accelerometer.py."""
 RIGID = (*LEO, *TURNED, 0.001, -0.002, 0.003)
 
@@ -122,6 +123,16 @@ def test_a_sun_sensor_points_at_the_sun_and_sees_nothing_in_the_shadow():
     assert bench.values("sun_sensor", [0], LIT)[0] == pytest.approx(SUN, abs=1e-6)
     assert bench.run([10], dark) == [{}]
     assert bench.suite.summary()["sun_sensor"] == {"samples": 1, "dropped": 0, "blind": 1}
+
+
+def test_a_biased_star_tracker_tells_an_attitude_yet():
+    bench = Bench(star_tracker={"rate_hz": HZ})
+    fault = SensorFault(sensor="star_tracker", fault="biased", bias=(0.1,))
+    bench.suite.begin_failure(1, fault)
+
+    values = bench.values("star_tracker", range(3), RIGID)
+
+    assert np.linalg.norm(values, axis=1) == pytest.approx(1.0)
 
 
 def test_a_sun_sensor_errs_by_an_angle():

@@ -122,6 +122,25 @@ def test_truth_is_that_of_a_commanded_burn_of_the_same_length_and_thrust(fly):
     assert np.array_equal(*others)
 
 
+@pytest.mark.slow
+def test_a_push_along_an_axis_of_a_body_that_spins_turns_with_it(fly):
+    spin = {"inertia_kg_m2": [1, 1, 1], "initial": "inertial", "rates_deg_s": [0, 0, 72]}
+    stuck, quiet = (fly(attitude={**spin, "has_gravity_gradient": False}) for _ in range(2))
+
+    (told,) = stick(stuck, ends_s=30.0, frame="body", direction=(1.0, 0.0, 0.0))
+    quiet.run(60.0)
+
+    # Four turns in 20 s: what 0.01 m/s^2 gives in one half of a turn is taken back in the other.
+    rate_rad_s = math.radians(72.0)
+    angle_rad = rate_rad_s * told["from_s"]
+    drift_m_s = 0.01 / rate_rad_s * np.array((-math.sin(angle_rad), math.cos(angle_rad), 0.0))
+    apart = state_rows(stuck, "agent-02")[-1] - state_rows(quiet, "agent-02")[-1]
+    assert apart[1:4] == pytest.approx(20.0 * drift_m_s, abs=5e-3)
+    assert apart[4:7] == pytest.approx(0.0, abs=5e-4)
+    assert told["delta_v_m_s"] == pytest.approx(0.2, rel=1e-3)
+    assert told["propellant_left_kg"] == pytest.approx(2.0 - 20.0 / EXHAUST_M_S)
+
+
 def test_flight_software_feels_it_reads_its_tank_and_closes_it_off(fly):
     star = fly(wait_s=15.0)
 

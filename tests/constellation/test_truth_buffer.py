@@ -71,9 +71,9 @@ def test_of_joints_that_differ_by_rounding_the_last_one_holds():
     buffer.add(straight(second_s, revision=2, speed=7003.0))
 
     assert buffer.lookup(6.9)[3] == 7000.0
-    assert buffer.given_m_s(6.9)[0] == 0.0
+    assert buffer.given_m_s(6.9) == ((0.0,) * 3, (0.0,) * 3)
     assert buffer.lookup(second_s)[3] == 7003.0
-    assert buffer.given_m_s(second_s)[0] == 3.0
+    assert buffer.given_m_s(second_s) == ((0.0,) * 3, (3.0, 0.0, 0.0))
 
 
 def test_segments_may_come_in_any_order():

@@ -27,7 +27,8 @@ class SensorFault:
     fault: Literal["stuck", "biased", "dead"]
     """stuck: its measurements repeat the first one since then; biased: `bias` is added to them; dead: none come."""
     bias: tuple[Annotated[float, Ge(-BIAS_MAX), Le(BIAS_MAX)], ...] = ()
-    """Of biased: added to the first values of each measurement, in the unit of its stream."""
+    """Of biased: added to the first values of each measurement, in the unit of its stream; a direction or a quaternion is
+    brought back to length 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

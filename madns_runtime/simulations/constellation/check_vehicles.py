@@ -48,6 +48,8 @@ FIELD_YEARS = {
     "igrf": (1900.0, 2030.0),
 }
 """First and last year of each model of the Earth's field; of the IGRF's 14th generation."""
+MOMENT_ROUNDING = 1e-12
+"""Of the largest moment of inertia: a flat body's is the sum of the others, but for rounding."""
 PENDING_MAX = 10_000
 """Measurements that a sensor may have under way: see vehicle.sensors.sensor."""
 
@@ -140,7 +142,7 @@ def _body_faults(field: str, vehicle: Vehicle) -> list[str]:
         )
     if vehicle.attitude is not None:
         a, b, c = sorted(vehicle.attitude.inertia_kg_m2)
-        if a + b < c:
+        if a + b < c * (1.0 - MOMENT_ROUNDING):
             faults.append(
                 f"{field}.attitude.inertia_kg_m2: no body has moments of which one exceeds the sum "
                 f"of the others, got {a:g}, {b:g} and {c:g}"

@@ -155,7 +155,9 @@ class StuckBurns:
         return StuckDirection(thrust_n=thrust_n, direction=direction, frame=given.frame)
 
     def _extend(self, burn: StuckBurn, t_s: float) -> None:
-        self._change(burn, self._stuck.extend(burn, t_s))
+        is_body = burn.push.frame == "body"
+        turn_rad_s = self._supply.turn_rad_s(burn.vehicle, burn.given_until_s) if is_body else 0.0
+        self._change(burn, self._stuck.extend(burn, t_s, turn_rad_s))
 
     def _change(self, burn: StuckBurn, changed_s: float | None) -> None:
         """Have truth propagated anew from a time on, and sent."""

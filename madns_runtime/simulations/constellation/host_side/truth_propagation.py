@@ -226,6 +226,11 @@ class TruthSupply:
 
         return self.jobs.submit(take, propagate_vehicles, [request], [self._parameters_of(vehicle)])
 
+    def turn_rad_s(self, vehicle: int, t_s: float) -> float:
+        """Return the rate at which a rigid body turns just before *t_s*, or where truth ends; 0 of what is forgotten."""
+        known = self.store.restart(vehicle, min(t_s, self.store.end_s))
+        return 0.0 if known is None else float(np.linalg.norm(known[1][10:]))
+
     def _change_request(self, vehicle: int, change_s: float) -> VehicleRequest | None:
         store = self.store
         if change_s > store.end_s:

@@ -93,7 +93,8 @@ class TruthBuffer:
         self._knot_s = 1.0
         self._turn: AttitudeCurve | None = None
         self._quaternion = IDENTITY
-        self._given_m_s = [0.0, 0.0, 0.0]
+        self._thrust_m_s = [0.0, 0.0, 0.0]
+        self._impulses_m_s = [0.0, 0.0, 0.0]
         self._given_until_s: float | None = None
 
     @property
@@ -150,18 +151,18 @@ class TruthBuffer:
         turned = evaluate_turn(self._turn, part, self._knot_s)
         return evaluate(self._cubics, part, self._knot_s) + turned
 
-    def given_m_s(self, t_s: float) -> Vector:
+    def given_m_s(self, t_s: float) -> tuple[Vector, Vector]:
         """
-        Return the change of velocity that thrust and impulses have given until *t_s*, m/s, inertial.
+        Return the changes of velocity that thrust, and that impulses, have given until *t_s*, m/s, inertial.
 
-        It counts from the first call on. Call it right after a `lookup` of the same time has found truth:
+        They count from the first call on. Call it right after a `lookup` of the same time has found truth:
         an impulse is the step in velocity where two segments meet.
         """
         if self._given_until_s is None:
             self._given_until_s = t_s
         self._give(self._pieces[0].thrust, t_s)
-        x, y, z = self._given_m_s
-        return x, y, z
+        (x, y, z), (a, b, c) = self._thrust_m_s, self._impulses_m_s
+        return (x, y, z), (a, b, c)
 
     @property
     def ballistic_m2_kg(self) -> float | None:
@@ -205,14 +206,14 @@ class TruthBuffer:
         if after.t0_s - piece.end_s <= TIME_EPSILON_S:
             before = piece.velocity_at_end()
             for axis in range(3):
-                self._given_m_s[axis] += after.rows[0][3 + axis] - before[axis]
+                self._impulses_m_s[axis] += after.rows[0][3 + axis] - before[axis]
 
     def _give(self, thrust: Thrust | None, until_s: float) -> None:
         """Add what a thrust gives from where the account ends; a thrust that was cut short is taken back."""
         if thrust is not None and self._given_until_s is not None:
             gained_s, _ = thrust.gains(self._given_until_s, until_s)
             for axis in range(3):
-                self._given_m_s[axis] += thrust.acceleration_m_s2[axis] * gained_s
+                self._thrust_m_s[axis] += thrust.acceleration_m_s2[axis] * gained_s
         self._given_until_s = until_s
 
     def _seek_turn(self, first: list[float], second: list[float]) -> None:

@@ -75,8 +75,8 @@ class Scene:
             vz,
         )
 
-    def given_m_s(self) -> Vector:
-        """Return the change of velocity by thrust and impulses since the first call, inertial, m/s."""
+    def given_m_s(self) -> tuple[Vector, Vector]:
+        """Return the changes of velocity by thrust, and by impulses, since the first call, inertial, m/s."""
         return self._pushes.given_m_s(self.t_s)
 
     def drag_m_s2(self) -> Vector:

@@ -9,7 +9,12 @@ from dataclasses import dataclass
 from madns_runtime.simulations.constellation.equipment import Magnetometer
 from madns_runtime.simulations.constellation.geomagnetic_field import field_model
 from madns_runtime.simulations.constellation.orbit.magnetic import decimal_year, inertial_field_t
-from madns_runtime.simulations.constellation.orbit.quaternions import from_rotation, multiply
+from madns_runtime.simulations.constellation.orbit.quaternions import (
+    from_rotation,
+    multiply,
+    rotate,
+    rotation_between,
+)
 from madns_runtime.simulations.constellation.vehicle.sensors.environment import Scene
 
 Measured = tuple[float, ...]
@@ -32,6 +37,8 @@ class Instrument:
     channels: int = 3
     """Errors that a measurement needs."""
     stream: str = ""
+    is_unit: bool = False
+    """Whether its values are of length 1: a direction or a quaternion."""
     is_mean: bool = False
     """Whether it measures the mean since its measurement before, and not an instant."""
 
@@ -83,26 +90,36 @@ class Accelerometer:
     It integrates, as real ones do: what it says is the mean since the measurement before. So a burn between two
     measurements is not lost, and their products with the time between them add up to the change of velocity. An
     impulse, which has no duration, is spread over the measurement that it falls in. Its axes are the body's, or
-    the frame's without attitude.
+    the frame's without attitude: thrust and drag of a tick turned as the body is in the middle of it, an impulse as at its end.
     """
 
     def __init__(self) -> None:
         self._sum_m_s = [0.0, 0.0, 0.0]
         self._since_s: float | None = None
         self._t_s = 0.0
-        self._given_m_s = self._drag_m_s2 = (0.0, 0.0, 0.0)
+        self._thrust_m_s = self._impulses_m_s = self._drag_m_s2 = (0.0, 0.0, 0.0)
+        self._attitude: tuple[float, ...] = ()
 
     def feel(self, scene: Scene) -> None:
-        """Take what acted since the tick before, turned as the body is now; called every tick."""
-        given, step_s = scene.given_m_s(), scene.t_s - self._t_s
+        """Take what acted since the tick before, in the body's axes; called every tick."""
+        (thrust, impulses), step_s = scene.given_m_s(), scene.t_s - self._t_s
+        attitude = scene.state[6:10]
         if self._since_s is None:
             self._since_s = scene.t_s
         else:
-            change = zip(given, self._given_m_s, self._drag_m_s2, strict=True)
+            change = zip(thrust, self._thrust_m_s, self._drag_m_s2, strict=True)
             x, y, z = (now - before + drag * step_s for now, before, drag in change)
-            for axis, gained in enumerate(scene.to_body((x, y, z))):
-                self._sum_m_s[axis] += gained
-        self._t_s, self._given_m_s, self._drag_m_s2 = scene.t_s, given, scene.drag_m_s2()
+            a, b, c = (
+                now - before for now, before in zip(impulses, self._impulses_m_s, strict=True)
+            )
+            steady: Vector = (x, y, z)
+            if attitude:
+                half = [angle / 2.0 for angle in rotation_between(self._attitude, attitude)]
+                steady = rotate(multiply(self._attitude, from_rotation(half)), steady)
+            for axis, gained in enumerate(zip(steady, scene.to_body((a, b, c)), strict=True)):
+                self._sum_m_s[axis] += sum(gained)
+        self._thrust_m_s, self._impulses_m_s, self._attitude = thrust, impulses, attitude
+        self._t_s, self._drag_m_s2 = scene.t_s, scene.drag_m_s2()
 
     def measure(self, scene: Scene, error: Row) -> Measured | None:
         """Return the mean specific force since the measurement before, m/s^2; None for the first, which has none."""

@@ -86,7 +86,7 @@ class Sensor:
         """Measurements that never came: dropouts, and those for which there was no room."""
         self.blind = 0
         """Measurements with nothing to measure."""
-        self.failures = SensorFailures()
+        self.failures = SensorFailures(is_unit=instrument.is_unit)
         self._measure = instrument.measure
         # Faster than that, its samples would be numbers that nobody measures.
         self._rate_hz = min(settings.rate_hz, step_hz or context.tick_hz)
@@ -114,12 +114,11 @@ class Sensor:
             self.dropped += 1
             return
         values = self._measure(scene, error)
+        if values is not None and self.failures:
+            values = self.failures.altered(values)
         if values is None:
             self.blind += 1
             return
-        if self.failures:
-            values = self.failures.altered(values)
-            assert values is not None  # as it is not dead
         self._pending.append((scene.t_s + self._latency_s, Reading(scene.t_s, values)))
 
     def counts(self) -> dict[str, int]:
@@ -180,8 +179,8 @@ class SensorSuite:
                 digits=12,
                 is_mean=True,
             ),
-            Instrument(name="star_tracker", measure=star_tracker, digits=12),
-            Instrument(name="sun_sensor", measure=sun_sensor, digits=9),
+            Instrument(name="star_tracker", measure=star_tracker, digits=12, is_unit=True),
+            Instrument(name="sun_sensor", measure=sun_sensor, digits=9, is_unit=True),
             # The stream clock is the framework's own.
             Instrument(name="clock", stream="clock_sensor", measure=clock, digits=12, channels=1),
         ]

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 from madns_runtime.simulations.constellation.actions import SensorFault
 
 Measured = tuple[float, ...]
 
 
 class SensorFailures:
-    """The failures of one sensor; several may be in force at a time."""
+    """
+    The failures of one sensor; several may be in force at a time.
 
-    def __init__(self) -> None:
+    Args:
+        is_unit: Whether its measurements are of length 1, as a direction and a quaternion are, also biased ones.
+    """
+
+    def __init__(self, *, is_unit: bool = False) -> None:
+        self._is_unit = is_unit
         self._failures: dict[int, SensorFault] = {}
         self._last: Measured | None = None
 
@@ -41,6 +49,11 @@ class SensorFailures:
             if each.fault == "biased":
                 added = (*each.bias, *(0.0,) * (len(values) - len(each.bias)))
                 values = tuple(v + b for v, b in zip(values, added, strict=False))
+        if self._is_unit:
+            length = math.hypot(*values)
+            if not length:
+                return None
+            values = tuple(value / length for value in values)
         if "stuck" not in kinds:
             return values
         self._last = values if self._last is None else self._last
