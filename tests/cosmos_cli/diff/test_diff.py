@@ -621,3 +621,33 @@ def test_a_stream_whose_table_is_in_another_unit_is_compared_in_its_own(make, ca
         "agent-01": ("m", 2.0),
         "agent-02": ("km", 2.0),
     }
+
+
+def add_rovers(made, mood, *rovers):
+    """Have the host record each of some rovers at each of ten times, under names of the plug-in's own."""
+    fields = (
+        Field("t_s", "s"),
+        Field("rover", "", "str"),
+        Field("mood", "", "str"),
+        Field("x_m", "m"),
+    )
+    recorder = made.recorder("host", "host", StreamSchema("rovers", fields))
+    for t in range(10):
+        for rover in rovers:
+            recorder.record("rovers", (float(t), rover, mood, 100.0 * ord(rover) + t))
+    recorder.close()
+
+
+def test_records_of_one_time_are_told_apart_by_a_text_of_any_name(make, capsys):
+    make(lambda made: add_rovers(made, "bored", "a", "b"))
+    make(lambda made: add_rovers(made, "keen", "b"))
+    make(lambda made: add_rovers(made, "keen", "c"))
+
+    _, document = diff(capsys, "1", "2")
+    found = streams_of(document)["host_rovers"]
+    assert (found["matched"], found["only_a"]["count"], found["only_b"]["count"]) == (10, 10, 0)
+    assert {n: f["different"] for n, f in found["fields"].items()} == {"mood": 10, "x_m": 0}
+    # Of one record at a time any text is a value.
+    _, document = diff(capsys, "2", "3")
+    found = streams_of(document)["host_rovers"]
+    assert (found["matched"], found["only_a"]["count"]) == (10, 0)
