@@ -106,16 +106,19 @@ class StatusAccount:
     times_lost: int = 0
     counted_s: float | None = None
     """Up to here time has been counted; None before simulated time runs."""
+    end_s: float = math.inf
+    """When simulated time is over: nothing counts from then on."""
 
     def observe(self, status: DeviceStatus, now_s: float) -> DeviceStatus | None:
         """Note the status at *now_s*, and return the one before if it has changed."""
         if self.counted_s is not None:
-            self.seconds[self.status] += max(0.0, now_s - self.counted_s)
-            self.counted_s = now_s
+            until_s = max(self.counted_s, min(now_s, self.end_s))
+            self.seconds[self.status] += until_s - self.counted_s
+            self.counted_s = until_s
         if status == self.status:
             return None
         before, self.status, self.since_s = self.status, status, now_s
-        if status == "lost" and self.counted_s is not None:
+        if status == "lost" and self.counted_s is not None and now_s <= self.end_s:
             self.times_lost += 1
         return before
 
