@@ -63,9 +63,9 @@ class StatusLimits:
         return "stale" if silent_s <= self.lost_s else "lost"
 
 
-def sample_period_s(rate_hz: float, channels: Sequence[Channel]) -> float:
+def sample_rate_hz(rate_hz: float, channels: Sequence[Channel]) -> float:
     """
-    Return the time from one sample of a device to the next, s: of its reads, or longer where all its inputs are slower.
+    Return how often a device gives samples, Hz: as often as it is read, or less where all its inputs are slower.
 
     Args:
         rate_hz: At which it is read.
@@ -79,7 +79,12 @@ def sample_period_s(rate_hz: float, channels: Sequence[Channel]) -> float:
     fastest_hz = max(
         (rate if rate and rate > 0.0 else math.inf for rate in rates), default=math.inf
     )
-    return 1.0 / min(rate_hz, fastest_hz)
+    return min(rate_hz, fastest_hz)
+
+
+def sample_period_s(rate_hz: float, channels: Sequence[Channel]) -> float:
+    """Return the time from one sample of a device to the next, s; see `sample_rate_hz`."""
+    return 1.0 / sample_rate_hz(rate_hz, channels)
 
 
 def limits_of(launch: DeviceLaunch, channels: Sequence[Channel]) -> StatusLimits:
