@@ -282,9 +282,27 @@ def test_what_a_users_driver_does_wrong_is_found(tmp_path, place, code, name, go
         assert got in wrong[name]
 
 
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"framing": "length_prefixed", "length_bytes": 4},
+        {"framing": "length_prefixed", "length_order": "big"},
+        {"framing": "lines", "frame_bytes_max": 4},
+    ],
+)
+def test_a_stand_in_sends_frames_as_the_line_has_them(tmp_path, parameters):
+    findings = verify(tmp_path, "serial", steps=("samples",), port="pty", **parameters)
+
+    assert failed(findings) == {}
+    assert "Hz" in findings["rate"]["got"], "some came"
+    assert findings["shapes"]["passed"]
+
+
 @pytest.mark.parametrize("may_write", [False, True])
 def test_a_driver_is_told_whether_its_outputs_may_move_before_each_opening(tmp_path, may_write):
-    text = DRIVER.replace("needs_hardware=False", "needs_hardware=True").replace("FAULT_READ", "pass")
+    text = DRIVER.replace("needs_hardware=False", "needs_hardware=True").replace(
+        "FAULT_READ", "pass"
+    )
     note = "print(self.may_move, file=open(__file__ + '.told', 'a'))"
     (tmp_path / "line.py").write_text(
         text.replace("FAULT_OPEN", note).replace("FAULT_WRITE", "pass")
