@@ -25,7 +25,9 @@ from madns_runtime.conditions.condition import HOST
 from madns_runtime.config import RunConfig, ScenarioDevice, to_mapping
 from madns_runtime.errors import MadnsError, PluginError
 from madns_runtime.hardware.contract import Channel
+from madns_runtime.hardware.kinds.playback import kind as PLAYER
 from madns_runtime.hardware.kinds.playback import streams_of
+from madns_runtime.hardware.status import sample_rate_hz
 from madns_runtime.hardware.stream_schemas import DEVICE_STATE
 from madns_runtime.plugin.queries import ask_rerun
 from madns_runtime.plugin.registry import is_file, is_shipped, parse_parameters, resolve
@@ -262,12 +264,14 @@ def _player(
         parameters |= {"ticks": str(agent.ticks), "phase_s": agent.phase_s}
     elif device is not None and device.kind == PLAYBACK:
         parameters |= _ticks_played(recorded, used, device, remarks)
-    rate_hz = (device.rate_hz if device else None) or (answer.rate_hz if answer else None)
+    asked_hz = (device.rate_hz if device else None) or (answer.rate_hz if answer else None)
+    # Its kind says what its inputs promise, a player's no more than its rate: by that it is stale, and lost.
+    rate_hz = sample_rate_hz(asked_hz or _recorded_rate(used.folder), channels)
     return ScenarioDevice(
         name=used.name,
         kind=PLAYBACK,
         agents=(used.agent,),
-        rate_hz=rate_hz or _recorded_rate(used.folder),
+        rate_hz=min(rate_hz, PLAYER.rate_hz_max),
         parameters=parameters,
         frozen_s=device.frozen_s if device else {},
     )
@@ -308,4 +312,4 @@ def _recorded_rate(folder: Path) -> float:
         times = [row[0] for row, _ in zip(stream.records(), range(RATE_ROWS_MAX), strict=False)]
         if len(times) > 2 and times[-1] > times[0]:
             rates.append((len(times) - 1) / (times[-1] - times[0]))
-    return min(max(rates[1:], default=RATE_HZ), 1000.0)
+    return max(rates[1:], default=RATE_HZ)

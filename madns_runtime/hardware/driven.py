@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 from collections.abc import Callable, Iterable, Mapping
@@ -19,8 +20,10 @@ from madns_runtime.hardware.kind_declaration import CHANNELS_MAX
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.page import DevicePage
 from madns_runtime.hardware.port import DevicePort
+from madns_runtime.hardware.records import SimulatedTime
 from madns_runtime.hardware.seat import DeviceSeat
 from madns_runtime.hardware.status import StatusAccount, StatusLimits, limits_of, sample_period_s
+from madns_runtime.plugin.device_view import DeviceStatus
 from madns_runtime.reactor.descriptors import allow_descriptors, ready
 from madns_runtime.signal_names import signal_name
 
@@ -44,6 +47,8 @@ class DrivenDevice:
     ends: Mapping[str, socket.socket]
     """The agents' ends of their pairs with it."""
     account: StatusAccount = field(default_factory=StatusAccount)
+    observed_s: float = math.inf
+    """When its status was noted last, s."""
     restarts: int = 0
     faults: dict[str, float | None] = field(default_factory=dict)
     """Inserted faults in force, by action."""
@@ -120,6 +125,18 @@ class DrivenDevice:
         self.faults[action] = value
         if action == "clear":
             self.faults.clear()
+
+    def observe(self, status: DeviceStatus, now_s: float) -> DeviceStatus | None:
+        """Note its status, which counts while simulated time runs, and return the one before if it has changed."""
+        told, time = self.seat.page.time.read(), SimulatedTime()
+        if told is not None:  # by an agent
+            time.set(*told[:3])
+            self.account.end_s = time.local_s(told[3])
+        before = self.account.observe(status, now_s)
+        if self.account.counted_s is None and time.at(now_s) >= 0.0:
+            self.account.begin(min(now_s, max(time.local_s(0.0), self.observed_s)))
+        self.observed_s = now_s
+        return before
 
     def blame(self, why: str) -> None:
         """Take note of why it is about to be lost: closing it may take a while, in which its newest sample is still fresh."""

@@ -97,10 +97,7 @@ class Intake:
         Raises:
             PluginError: It is no sample of this device's inputs.
         """
-        if not isinstance(sample, Sample):
-            raise PluginError(f"expected a Sample or None, got {type(sample).__name__}")
-        _check_times(sample, now_s + ahead_s, now_s)
-        sample = self._checked(sample)
+        sample = checked_sample(sample, self._inputs, now_s, ahead_s=ahead_s)
         self._page.header[page.ACTIVE_S] = now_s
         if not sample.values and self._inputs:
             # Nothing new, as None says it: only a device of outputs alone shows so that it is there.
@@ -143,26 +140,6 @@ class Intake:
     def summary(self) -> dict[str, Any]:
         """Return the counts of a run, those of earlier processes with them."""
         return counts_of(self._page)
-
-    def _checked(self, sample: Sample) -> Sample:
-        """
-        Return a sample with values of its own, as numbers and bytes: a driver may fill its buffers again while a fault holds it.
-
-        Raises:
-            PluginError: A value is none of an input of this device.
-        """
-        given: Any = sample.values
-        if not isinstance(given, Mapping):
-            raise PluginError(f"expected values by channel in a Sample, got {given!r:.80}")
-        values: dict[str, Any] = {}
-        for name, value in given.items():
-            channel = self._inputs.get(name)
-            if channel is None:
-                raise PluginError(f"a sample holds {name!r}, which is no input of the device")
-            values[name] = (
-                to_frame(channel, value) if channel.is_frame else to_numbers(channel, value)
-            )
-        return dataclasses.replace(sample, values=values)
 
     def _tell(self, sample: Sample, now_s: float) -> None:
         """Make a sample that was checked the newest, pass on its frames, record it."""
@@ -230,6 +207,36 @@ class Intake:
         self.count("frames_missed", self._pass_on(message))
 
 
+def checked_sample(
+    sample: object, inputs: Mapping[str, Channel], now_s: float, *, ahead_s: float = 0.0
+) -> Sample:
+    """
+    Return a sample with values of its own, as numbers and bytes: a driver may fill its buffers again while a fault holds it.
+
+    Args:
+        sample: What a driver gave.
+        inputs: The device's inputs by their names.
+        now_s: The present, on this machine's monotonic clock, s.
+        ahead_s: How far it may lie in the future, s.
+
+    Raises:
+        PluginError: It is no sample of these inputs.
+    """
+    if not isinstance(sample, Sample):
+        raise PluginError(f"expected a Sample or None, got {type(sample).__name__}")
+    _check_times(sample, now_s + ahead_s, now_s)
+    given: Any = sample.values
+    if not isinstance(given, Mapping):
+        raise PluginError(f"expected values by channel in a Sample, got {given!r:.80}")
+    values: dict[str, Any] = {}
+    for name, value in given.items():
+        channel = inputs.get(name)
+        if channel is None:
+            raise PluginError(f"a sample holds {name!r}, which is no input of the device")
+        values[name] = to_frame(channel, value) if channel.is_frame else to_numbers(channel, value)
+    return dataclasses.replace(sample, values=values)
+
+
 def _check_times(sample: Sample, latest_s: float, now_s: float) -> None:
     """
     Refuse a sample whose times are none, still to come, or so long ago that its age has no room on record.
@@ -265,16 +272,18 @@ def counts_of(device_page: DevicePage) -> dict[str, Any]:
     }
 
 
-def silent_inputs(channels: Iterable[Channel], device_page: DevicePage) -> list[str]:
-    """Return the inputs of numbers of which no value ever came; queues are left out, for nothing may have happened."""
+def promised_inputs(channels: Iterable[Channel]) -> list[str]:
+    """Return the inputs of numbers; queues are left out, for nothing may have happened."""
     return [
         each.name
         for each in channels
-        if each.direction == "in"
-        and not each.is_frame
-        and each.passing == "newest"
-        and not device_page.read(each.name).number
+        if each.direction == "in" and not each.is_frame and each.passing == "newest"
     ]
+
+
+def silent_inputs(channels: Iterable[Channel], device_page: DevicePage) -> list[str]:
+    """Return the promised inputs of which no value ever came."""
+    return [name for name in promised_inputs(channels) if not device_page.read(name).number]
 
 
 def least_stale_age_s(device_page: DevicePage, limits: StatusLimits) -> float | None:

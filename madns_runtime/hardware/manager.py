@@ -340,9 +340,7 @@ class DeviceManager:
             driven.forgive()
         elif process.has_words():
             self._hear(process)  # why it was closed may wait
-        if driven.account.counted_s is None and driven.seat.page.time.read() is not None:
-            driven.account.begin(now_s)  # an agent has told that simulated time runs
-        if driven.account.observe(status, now_s) is not None:
+        if driven.observe(status, now_s) is not None:
             if status == "lost":
                 driven.loss = driven.why or driven.why_silent()
                 driven.seat.page.loss.write(driven.loss)
@@ -364,7 +362,7 @@ class DeviceManager:
             return
         self._is_ending = True
         for driven in self._devices.values():
-            driven.account.observe(driven.account.status, monotonic())
+            driven.observe(driven.account.status, monotonic())
         for process in self._processes:
             process.tell([messages.END, why])
         self._tell_guardian(guardian.OVER)

@@ -10,7 +10,7 @@ from time import monotonic
 from typing import Any, Final
 
 from madns_runtime.errors import MachineError, MadnsError, PluginError
-from madns_runtime.hardware import driver_answers, messages, page
+from madns_runtime.hardware import driver_answers, messages, page, simulated
 from madns_runtime.hardware.contract import Device, SimulatedDevice
 from madns_runtime.hardware.descriptor import DriverDescriptor
 from madns_runtime.hardware.fault_orders import CarriedOutEnds
@@ -20,7 +20,6 @@ from madns_runtime.hardware.outputs import DeviceOutputs, DueOutput
 from madns_runtime.hardware.process_resources import has_descriptors, leak_of, resident_bytes
 from madns_runtime.hardware.records import DeviceRecords
 from madns_runtime.hardware.seat import DeviceSeat
-from madns_runtime.hardware.simulated import next_of, pass_over, samples_by_now
 from madns_runtime.hardware.status import LOST_PERIODS, back_off_s, limits_of, sample_period_s
 from madns_runtime.plugin.code_places import error_text
 from madns_runtime.reactor.reactor import Reactor
@@ -63,14 +62,12 @@ class DeviceRunner:
         """Told of an inserted fault that came from an agent, before the device is closed for it."""
         self._device: Device | None = None
         self._descriptor: DriverDescriptor | None = None
-        self._failures = 0
-        self._late_us_max = 0
-        self._is_ending = False
+        self._failures = self._late_us_max = 0
+        self._is_ending = self._is_own = False
         self.gave_up = ""
         """Why its process has to be started anew; empty if it has not."""
         self._first_bytes = 0
         """Memory of this process when the device was opened first; 0 before."""
-        self._is_own = False
         self._period_s = 1.0 / launch.rate_hz
         self._hang_s = limits_of(launch, seat.channels).hang_s
         sample_s = sample_period_s(launch.rate_hz, seat.channels)
@@ -106,7 +103,8 @@ class DeviceRunner:
             self._reactor.end_if_forked()
             self._seat.check_identity(identity)
             self._is_own = True
-            self._intake.count("passed_while_closed", pass_over(device, self._records.time, header))
+            passed = simulated.pass_over(device, self._records.time, header)
+            self._intake.count("passed_while_closed", passed)
             method = "fileno"
             if (fd := driver_answers.descriptor_of(device.fileno())) is not None:
                 intake, readable = self._intake, self._readable
@@ -215,9 +213,7 @@ class DeviceRunner:
         if not self._read():
             return
         if self._next_s is not None:
-            time = self._records.time
-            wait_s = time.until(self._next_s) if time.is_known else self._period_s
-            self._due_s = monotonic() + min(max(wait_s, 0.0), STATE_PERIOD_S)
+            self._due_s = monotonic() + simulated.pause_s(self._records.time, self._next_s)
             self._read_timer.reschedule(self._due_s)
             return
         # The next whole period, so that a slow read does not shift those after it.
@@ -245,9 +241,10 @@ class DeviceRunner:
         self._header[page.ACTIVE_S] = monotonic()
         try:
             if isinstance(device, SimulatedDevice):
-                for given in samples_by_now(device, self._records.time, BURST_MAX):
+                time = self._records.time
+                for given in simulated.samples_by_now(device, time, self._header, BURST_MAX):
                     self._take(given)
-                self._next_s = next_of(device)
+                self._next_s = simulated.next_of(device)
             elif (sample := device.read()) is not None:
                 self._take(sample)
         except BaseException as error:  # noqa: BLE001 - a driver may raise anything
@@ -284,6 +281,8 @@ class DeviceRunner:
         if (told := self._seat.page.time.read()) is not None:
             self._records.set_time(*told)
             self._schedule_write()
+            if self._next_s is not None:
+                self._read_timer.reschedule(monotonic())
 
     def _take_output(self, agent: str, word: str, *rest: Any) -> None:
         """Let a value, or points of a profile, wait until they are due."""
@@ -373,7 +372,8 @@ class DeviceRunner:
         now_s, header = monotonic(), self._header
         details: Mapping[str, Any] = {}
         heard_s = max(header[page.ARRIVED_S], header[page.OPENED_S], self._intake.withheld_s)
-        if self._device is not None and now_s - heard_s > self._silent_s:
+        waits = simulated.is_waited_for(self._records.time, self._next_s)
+        if self._device is not None and not waits and now_s - heard_s > self._silent_s:
             self._fail("read", MachineError(f"no sample within {self._silent_s:g} s"))
         if self._device is not None:
             try:

@@ -29,6 +29,7 @@ from madns_runtime.hardware.values import from_numbers
 from madns_runtime.plain_values import from_mapping
 from madns_runtime.reactor.reactor import Reactor
 from madns_runtime.recording.reader import read_stream
+from madns_runtime.recording.stream_file import files_of
 
 USER: Final = "cosmos-devices"
 """Stands for the agent that uses the devices."""
@@ -163,18 +164,21 @@ def figures_of(folder: Path) -> dict[str, Any]:
     """Return what a device's records say: its identity, what befell it, and figures of each input."""
     identity, why = "", ""
     channels: dict[str, Any] = {}
-    for path in sorted(folder.glob("*.jsonl")):
-        stream = read_stream(path)
-        if path.stem == "events":
-            for event in stream.records():
+    for name in sorted({path.name.partition(".")[0] for path in folder.glob("*.jsonl")}):
+        # A process that was started anew has begun files of its own.
+        streams = [read_stream(path) for path in files_of(folder, name)]
+        records = (record for stream in streams for record in stream.records())
+        fields = next((stream.field_names for stream in streams if stream.field_names), ())
+        if name == "events":
+            for event in records:
                 values = event if isinstance(event, dict) else {}
                 identity = str(values.get("identity") or identity)
                 why = str(values.get("why") or why) if values.get("event") == "error" else why
-        elif stream.field_names[:3] == ("t_s", "number", "age_us"):
-            channels[path.stem] = _input_figures([record[:3] for record in stream.records()])
-        elif stream.field_names[:2] == ("t_s", "lateness_us"):
-            lateness = sorted(record[1] for record in stream.records())
-            channels[path.stem] = {"written": len(lateness), "lateness_us": _share(lateness, 0.99)}
+        elif fields[:3] == ("t_s", "number", "age_us"):
+            channels[name] = _input_figures([record[:3] for record in records])
+        elif fields[:2] == ("t_s", "lateness_us"):
+            lateness = sorted(record[1] for record in records)
+            channels[name] = {"written": len(lateness), "lateness_us": _share(lateness, 0.99)}
     return {"identity": identity, "error": why, "channels": channels}
 
 

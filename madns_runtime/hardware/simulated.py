@@ -17,6 +17,8 @@ AT_ONCE_S: Final = 0.01
 """Simulated time within which samples count as of one time, s: a driver that goes on by nanoseconds comes to no end either."""
 AT_ONCE_MAX: Final = 10_000
 """Samples of one simulated time, unless they are finite; a tick's watchdog waits for longer than they take."""
+ASKED_AGAIN_S: Final = 0.5
+"""Until a device is asked again that has nothing new for longer: simulated time may come to be known, or run at another rate."""
 STANDS_STILL: Final = (
     "next_s() should tell of a later time once sample_at() has given what there was"
 )
@@ -94,23 +96,42 @@ def pass_over(device: Device, time: SimulatedTime, header: memoryview[float]) ->
     return passed
 
 
+def pause_s(time: SimulatedTime, next_s: float) -> float:
+    """Return how long to wait before a device is asked that has something new at simulated time *next_s*, s."""
+    return min(max(time.until(next_s), 0.0), ASKED_AGAIN_S) if time.is_known else ASKED_AGAIN_S
+
+
+def is_waited_for(time: SimulatedTime, next_s: float | None) -> bool:
+    """Tell whether a device may be silent, as it has told that it has nothing new before a simulated time to come."""
+    return next_s is not None and not (time.is_known and time.until(next_s) < 0.0)
+
+
 def samples_by_now(
-    device: SimulatedDevice, time: SimulatedTime, count_max: int
+    device: SimulatedDevice, time: SimulatedTime, header: memoryview[float], count_max: int
 ) -> Iterator[Sample]:
     """
-    Yield what a device gives by now, taken at times of this machine's clock; before simulated time runs, what it gives at 0.
+    Yield what a device gives by now, taken at times of this machine's clock.
+
+    Before simulated time runs, one that is asked at its rate gives what it gives at 0, and one whose samples have times of
+    their own nothing, and is not waited for.
 
     Args:
         device: It is open.
         time: Simulated time.
+        header: Of its page.
         count_max: Samples at most; the rest comes with the next call.
     """
     now_s = monotonic()
-    t_s = time.at(now_s) if time.is_known else 0.0
+    t_s = time.at(now_s) if time.is_known else -math.inf
+    next_s = next_of(device)
+    if next_s is not None and t_s < 0.0:
+        header[page.OPENED_S] = now_s
     for _ in range(count_max):
+        if next_s is not None and next_s > t_s:
+            return
         sample = device.sample_at(max(t_s, 0.0))
         if sample is not None:
             yield dataclasses.replace(sample, taken_s=now_s - (max(t_s, 0.0) - sample.taken_s))
         next_s = next_of(device)
-        if next_s is None or next_s > t_s:
+        if next_s is None:
             return

@@ -63,9 +63,9 @@ class StatusLimits:
         return "stale" if silent_s <= self.lost_s else "lost"
 
 
-def sample_period_s(rate_hz: float, channels: Sequence[Channel]) -> float:
+def sample_rate_hz(rate_hz: float, channels: Sequence[Channel]) -> float:
     """
-    Return the time from one sample of a device to the next, s: of its reads, or longer where all its inputs are slower.
+    Return how often a device gives samples, Hz: as often as it is read, or less where all its inputs are slower.
 
     Args:
         rate_hz: At which it is read.
@@ -79,7 +79,12 @@ def sample_period_s(rate_hz: float, channels: Sequence[Channel]) -> float:
     fastest_hz = max(
         (rate if rate and rate > 0.0 else math.inf for rate in rates), default=math.inf
     )
-    return 1.0 / min(rate_hz, fastest_hz)
+    return min(rate_hz, fastest_hz)
+
+
+def sample_period_s(rate_hz: float, channels: Sequence[Channel]) -> float:
+    """Return the time from one sample of a device to the next, s; see `sample_rate_hz`."""
+    return 1.0 / sample_rate_hz(rate_hz, channels)
 
 
 def limits_of(launch: DeviceLaunch, channels: Sequence[Channel]) -> StatusLimits:
@@ -106,16 +111,19 @@ class StatusAccount:
     times_lost: int = 0
     counted_s: float | None = None
     """Up to here time has been counted; None before simulated time runs."""
+    end_s: float = math.inf
+    """When simulated time is over: nothing counts from then on."""
 
     def observe(self, status: DeviceStatus, now_s: float) -> DeviceStatus | None:
         """Note the status at *now_s*, and return the one before if it has changed."""
         if self.counted_s is not None:
-            self.seconds[self.status] += max(0.0, now_s - self.counted_s)
-            self.counted_s = now_s
+            until_s = max(self.counted_s, min(now_s, self.end_s))
+            self.seconds[self.status] += until_s - self.counted_s
+            self.counted_s = until_s
         if status == self.status:
             return None
         before, self.status, self.since_s = self.status, status, now_s
-        if status == "lost" and self.counted_s is not None:
+        if status == "lost" and self.counted_s is not None and now_s <= self.end_s:
             self.times_lost += 1
         return before
 

@@ -616,7 +616,8 @@ def test_a_disconnected_device_hands_on_no_sample_that_a_delay_holds(tmp_path):
     assert report["delayed_left"] >= 5
 
 
-def test_a_recording_that_is_opened_anew_goes_on_and_does_not_begin_anew(tmp_path):
+def tape_launch(tmp_path, times_s, **settings) -> DeviceLaunch:
+    """Write a recording of the values 0, 1, ... at some times, and return what plays it."""
     recorded = tmp_path / "recorded"
     recorded.mkdir()
     fields = ",".join(
@@ -624,9 +625,9 @@ def test_a_recording_that_is_opened_anew_goes_on_and_does_not_begin_anew(tmp_pat
     )
     (recorded / "v.jsonl").write_text(
         f'{{"schema":1,"stream":"v","shape":"array","fields":[{fields}]}}\n'
-        + "".join(f"[{number / 50},{number + 1},0,{number}]\n" for number in range(50 * 60))
+        + "".join(f"[{t_s},{number + 1},0,{number}]\n" for number, t_s in enumerate(times_s))
     )
-    launch = DeviceLaunch(
+    return DeviceLaunch(
         name="tape",
         place="pi22",
         kind="playback",
@@ -634,7 +635,12 @@ def test_a_recording_that_is_opened_anew_goes_on_and_does_not_begin_anew(tmp_pat
         rate_hz=50.0,
         parameters={"directory": "recorded"},
         users=(AGENT,),
+        **settings,
     )
+
+
+def test_a_recording_that_is_opened_anew_goes_on_and_does_not_begin_anew(tmp_path):
+    launch = tape_launch(tmp_path, [number / 50 for number in range(50 * 60)])
     bench = DeviceBench(tmp_path, (launch,))
     try:
         bench.start_time()
@@ -652,3 +658,20 @@ def test_a_recording_that_is_opened_anew_goes_on_and_does_not_begin_anew(tmp_pat
     values = [record[3] for record in records(tmp_path, "v", "pi22/tape")]
     assert values == sorted(set(values))
     assert result["report"]["passed_while_closed"] >= before
+
+
+def test_a_recording_begins_with_simulated_time_and_is_no_fault_where_it_has_a_gap(tmp_path):
+    bench = DeviceBench(tmp_path, (tape_launch(tmp_path, [0.0, 0.1, 2.6], hang_s=0.2),))
+    try:
+        tape = bench.hardware["tape"]
+        bench.run(1.5)
+        assert (tape["v"].number, tape.status) == (0, "never"), "time is still to begin"
+        bench.start_time()
+        bench.until(lambda: tape["v"].number >= 3)
+    finally:
+        result = bench.close()["pi22/tape"]
+
+    assert [record[3] for record in records(tmp_path, "v", "pi22/tape")] == [0, 1, 2]
+    assert records(tmp_path, "v", "pi22/tape")[0][0] == 0.0, "its own time"
+    assert result["errors"] == 0
+    assert result["report"].get("passed_while_closed", 0) == 0

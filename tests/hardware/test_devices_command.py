@@ -57,6 +57,35 @@ def line_device(terminal: Terminal, **parameters: str) -> str:
     return f"{{name: line, kind: './line.py:Line', rate_hz: {RATE_HZ}, outputs: true, parameters: {{{values}}}}}"
 
 
+def stream(path: Path, names: str, *lines: str) -> None:
+    """Write a stream of arrays without an end, as a process leaves it that is killed."""
+    fields = [{"name": name, "unit": "", "kind": "float"} for name in names.split()]
+    head = {"schema": 1, "stream": path.name.partition(".")[0], "shape": "array", "fields": fields}
+    path.write_text("\n".join([json.dumps(head), *lines, ""]))
+
+
+def test_figures_are_of_all_processes_that_a_device_had(tmp_path: Path) -> None:
+    level, valve = "t_s number age_us level", "t_s lateness_us valve"
+    stream(tmp_path / "level.jsonl", level, "[0.0,1,100,5.0]", "[0.1,2,100,5.0]")
+    stream(tmp_path / "level.2.jsonl", level, "[0.5,3,900,5.0]")
+    stream(tmp_path / "level.10.jsonl", level, "[0.8,4,100,5.0]")
+    stream(tmp_path / "valve.jsonl", valve, "[0.0,40,1.0]")
+    stream(tmp_path / "valve.2.jsonl", valve, "[0.5,50,1.0]")
+    for number, why in ((".2", "no line"), ("", "no chip")):
+        (tmp_path / f"events{number}.jsonl").write_text(
+            '{"schema":1,"stream":"events","shape":"object","fields":[]}\n'
+            f'{{"t_s":0.1,"event":"error","why":"{why}"}}\n'
+        )
+
+    found = sampling.figures_of(tmp_path)
+
+    assert found["error"] == "no line", "the last one"
+    assert found["channels"].keys() == {"level", "valve"}
+    got = found["channels"]["level"]
+    assert (got["samples"], got["rate_hz"], got["age_us_max"]) == (4, pytest.approx(3.75), 900)
+    assert found["channels"]["valve"] == {"written": 2, "lateness_us": 50}
+
+
 GAUGE = """
 import os, time
 from pathlib import Path

@@ -282,6 +282,21 @@ def test_value_that_the_model_refuses_is_told(image):
             wait_until(lambda: mcu.read() and False)
 
 
+def test_property_that_holds_no_number_is_named(image):
+    sensor = {
+        "name": "magnetometer",
+        "model": "lsm303dlhc_mag",
+        "properties": ["type"],
+        "limits": [0.0, 1.0],
+    }
+    told = "sensor magnetometer: expected a number in type of lsm303dlhc_mag, got 'lsm303dlhc_mag'"
+    with (
+        opened("emulated_mcu", firmware=image, sensors=[sensor]) as mcu,
+        pytest.raises(MachineError, match=told),
+    ):
+        wait_until(lambda: mcu.read() and False)
+
+
 def test_channels_of_sensors_are_declared_both_ways():
     channels = {
         each.name: each for each in prepare("emulated_mcu", {"firmware": "x"}, HERE).channels

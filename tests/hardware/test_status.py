@@ -78,6 +78,18 @@ def test_account_counts_losses_and_the_share_of_bad_time_from_simulated_time_zer
     assert account.stale_ratio() == pytest.approx(0.2)
 
 
+def test_what_becomes_of_a_device_after_simulated_time_is_over_does_not_count():
+    account = StatusAccount(end_s=110.0)
+    account.observe("ok", 95.0)
+    account.begin(100.0)
+    account.observe("stale", 109.0)
+    account.observe("lost", 112.0)
+    account.observe("lost", 120.0)
+
+    assert account.times_lost == 0
+    assert account.stale_ratio() == pytest.approx(0.1)
+
+
 def test_a_device_that_is_lost_when_the_run_begins_is_a_loss():
     account = StatusAccount()
     account.observe("lost", 90.0)
@@ -85,6 +97,32 @@ def test_a_device_that_is_lost_when_the_run_begins_is_a_loss():
 
     assert account.times_lost == 1
     assert account.stale_ratio() is None
+
+
+def driven_for_8_s_from_100() -> DrivenDevice:
+    """Return a device whose agent has told before that simulated time runs from 100 s on, for 8 s."""
+    launch = DeviceLaunch(name="d", place="m", kind="null", base_directory="", rate_hz=10.0)
+    driven = DrivenDevice.share(launch, prepare("null", {}, None))
+    driven.seat.page.time.write(99.0, -1.0, 1.0, 8.0)
+    return driven
+
+
+def test_the_share_of_bad_time_is_of_simulated_time_alone():
+    driven = driven_for_8_s_from_100()
+    looks = {99.5: "never", 99.9: "never", 100.1: "ok", 107.9: "ok", 108.1: "stale", 109.5: "lost"}
+    for now_s, status in looks.items():
+        driven.observe(status, now_s)
+
+    assert driven.account.seconds == pytest.approx({"never": 0, "ok": 8.0, "stale": 0, "lost": 0})
+    assert (driven.account.stale_ratio(), driven.account.times_lost) == (0.0, 0)
+
+
+def test_of_a_device_that_is_driven_anew_nothing_counts_before_it_is_looked_at():
+    driven = driven_for_8_s_from_100()
+    driven.observe("never", 103.0)
+    driven.observe("ok", 104.0)
+
+    assert driven.account.seconds["never"] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

@@ -69,3 +69,41 @@ def test_the_records_of_all_processes_that_a_device_had_are_played_and_compared(
         "agent-01/imu: its process was started anew, 1 time: what an earlier one had not written when it ended is"
         " in no rerun"
     ]
+
+
+SLOW = """
+from madns_runtime.hardware.contract import Channel, DeviceKind, Sample, SimulatedDevice
+
+
+class Thermometer(SimulatedDevice):
+    kind = DeviceKind(
+        name="thermometer",
+        summary="is read often, and has something new once per second",
+        needs_hardware=False,
+        can_block=False,
+        follows_simulated_time=True,
+        rate_hz=2000.0,
+        rate_hz_max=5000.0,
+        channels=(Channel(name="heat", unit="degC", rate_hz_max=1.0),),
+    )
+
+    def sample_at(self, t_s):
+        return Sample(values={"heat": t_s}, taken_s=t_s) if t_s == round(t_s) else None
+"""
+
+
+def test_a_device_that_gives_less_than_it_is_read_is_as_fresh_as_it_was(tmp_path):
+    (tmp_path / "heat.py").write_text(SLOW)
+    scenario = SCENARIO[: SCENARIO.index("hardware:")].replace(": imu", ": heat")
+    device = "hardware: {devices: [{name: heat, kind: ./heat.py:Thermometer}]}\n"
+    (tmp_path / "again.yaml").write_text(scenario + device)
+    cosmos = CosmosCommand(tmp_path)
+    _, document = cosmos.run(tmp_path / "again.yaml", "agents.tick_hz=20", "time.duration_s=3")
+
+    done = cosmos("rerun", document["run"], "--json", "--quiet")
+    told = json.loads(done.stdout)
+
+    assert (done.returncode, told["same"]) == (0, True), done.stderr
+    rerun = json.loads((cosmos.directory(document).parent / told["rerun"] / "run.json").read_text())
+    ratios = [run["devices"]["agent-01/heat"]["stale_ratio"] for run in (document, rerun)]
+    assert ratios == [0.0, 0.0]

@@ -252,6 +252,12 @@ def test_a_guardian_that_hears_late_leaves_it_to_the_next_process(tmp_path):
         ("OPEN", "os._exit(3)", "opening", "its process ended with 3"),
         ("READ", "return Sample(values={'level': 7.0}, taken_s=time.monotonic())", "limits", "level "),
         ("READ", "return Sample(values={'level': [1, 2]}, taken_s=time.monotonic())", "shapes", "expected a number"),
+        ("OPEN", "return 5", "opening", "expected a text as the device's identity, got 5"),
+        ("OPEN", "self.health = lambda: 5", "opening", "expected a mapping of what is known"),
+        ("OPEN", "self.fileno = lambda: os.open(__file__, 0)", "opening", "got a regular file's"),
+        ("READ", "return Sample(values={'level': 0.5}, taken_s=0.0, device_s='noon')", "shapes", "device_s: expected"),
+        ("READ", "return Sample(values={'level': 0.5}, taken_s=time.monotonic() - 9.0)", "age", "9000 ms of the you"),
+        ("READ", "return Sample(values={}, taken_s=time.monotonic())", "rate", "0.0 Hz: 0 samples in "),
         ("READ", "return 7", "shapes", "expected a Sample or None, got int"),
         ("READ", "time.sleep(0.1)", "rate", "Hz"),
         ("READ", "return None", "rate", "0.0 Hz: 0 samples in "),
@@ -274,6 +280,53 @@ def test_what_a_users_driver_does_wrong_is_found(tmp_path, place, code, name, go
         assert safe["passed"] or is_late(safe)
     else:
         assert got in wrong[name]
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"framing": "length_prefixed", "length_bytes": 4},
+        {"framing": "length_prefixed", "length_order": "big"},
+        {"framing": "lines", "frame_bytes_max": 4},
+    ],
+)
+def test_a_stand_in_sends_frames_as_the_line_has_them(tmp_path, parameters):
+    findings = verify(tmp_path, "serial", steps=("samples",), port="pty", **parameters)
+
+    assert failed(findings) == {}
+    assert "Hz" in findings["rate"]["got"], "some came"
+    assert findings["shapes"]["passed"]
+
+
+@pytest.mark.parametrize("may_write", [False, True])
+def test_a_driver_is_told_whether_its_outputs_may_move_before_each_opening(tmp_path, may_write):
+    text = DRIVER.replace("needs_hardware=False", "needs_hardware=True").replace(
+        "FAULT_READ", "pass"
+    )
+    note = "print(self.may_move, file=open(__file__ + '.told', 'a'))"
+    (tmp_path / "line.py").write_text(
+        text.replace("FAULT_OPEN", note).replace("FAULT_WRITE", "pass")
+    )
+
+    verify(tmp_path, "./line.py", cycles=1, may_write=may_write, steps=("opening", "samples"))
+
+    assert set((tmp_path / "line.py.told").read_text().split()) == {str(may_write)}
+
+
+def test_outputs_are_made_safe_after_a_write_that_failed_and_what_never_came_is_told(tmp_path):
+    text = DRIVER.replace("FAULT_OPEN", "pass").replace("FAULT_WRITE", "raise OSError('stuck')")
+    text = text.replace("FAULT_READ", "pass").replace(
+        "        channels=(\n", "        channels=(\n            Channel(name='heat'),\n"
+    )
+    safe = "    def make_safe(self):\n        open(__file__ + '.safe', 'w').close()\n"
+    (tmp_path / "line.py").write_text(f"{text}\n{safe}")
+
+    findings = verify(tmp_path, "./line.py", steps=("samples", "outputs"))
+
+    assert failed(findings) == {"outputs": "OSError: stuck"}
+    assert (tmp_path / "line.py.safe").exists()
+    assert findings["inputs"]["passed"] is None
+    assert findings["inputs"]["got"] == "no value came of heat"
 
 
 @pytest.mark.parametrize(

@@ -301,13 +301,27 @@ class EmulatedMcu(Device):
         values: dict[str, list[float] | float] = {}
         for sensor in sensors:
             numbers = [
-                self._held[sensor.name, element] / sensor.counts_per_unit
+                self._number(sensor, element) / sensor.counts_per_unit
                 for element in range(len(sensor.properties))
             ]
             values[f"{sensor.name}{HELD}"] = numbers if len(numbers) > 1 else numbers[0]
         self._held.clear()
         self._is_asked = False
         return values
+
+    def _number(self, sensor: EmulatedSensor, element: int) -> float:
+        """
+        Return what an element holds, in the property's own counts.
+
+        Raises:
+            MachineError: The property is no number's.
+        """
+        told = self._held[sensor.name, element]
+        if not isinstance(told, int | float):
+            raise MachineError(
+                f"sensor {sensor.name}: expected a number in {sensor.properties[element]} of {sensor.model}, got {told!r:.80}"
+            )
+        return float(told)
 
     def _words_fd(self) -> int:
         assert self._process is not None

@@ -27,6 +27,7 @@ from madns_runtime.hardware.verification.order import (
     finding,
     has_stand_in,
     make_program,
+    may_write,
     spec_of,
 )
 from madns_runtime.hardware.verification.process import claimed, lose_device
@@ -41,7 +42,7 @@ def verify_device(order: VerificationOrder) -> Findings:
         program = make_program(order, "/dev/null" if has_stand_in(order) else None)
     except MadnsError as error:
         return [finding("declaration", False, str(error), "a kind that loads, with its parameters")]
-    may_write = order.may_write or not program.kind.needs_hardware or has_stand_in(order)
+    may_move = may_write(order, program.kind)
     rate_hz = order.rate_hz or program.kind.rate_hz
     is_asked = order.rate_hz is not None or has_stand_in(order)
     findings: Findings = [
@@ -59,12 +60,12 @@ def verify_device(order: VerificationOrder) -> Findings:
         runs: dict[str, Callable[[], Findings]] = {
             **{name: partial(claimed, order, line_program, run) for name, run in driven.items()},
             # Which claims it as a run does.
-            "process": lambda: lose_device(order, line_program, rate_hz, may_write),
+            "process": lambda: lose_device(order, line_program, rate_hz, may_move),
         }
         for name, step in runs.items():
             if name not in order.steps:
                 continue
-            why = _why_not(name, program, findings, may_write=may_write)
+            why = _why_not(name, program, findings, may_move=may_move)
             findings += [finding(name, None, why)] if why else run_step(name, step)
             if findings[-1].name == "opening" and not findings[-1].passed:
                 return findings  # the reason stands there once
@@ -75,11 +76,11 @@ def verify_device(order: VerificationOrder) -> Findings:
     return findings
 
 
-def _why_not(name: str, program: DeviceProgram, findings: Findings, *, may_write: bool) -> str:
+def _why_not(name: str, program: DeviceProgram, findings: Findings, *, may_move: bool) -> str:
     """Return why a step is not taken; "" if it is."""
     if name == "outputs" and not any(c.direction == "out" for c in program.channels):
         return "it has none"
-    if name == "outputs" and not may_write:
+    if name == "outputs" and not may_move:
         return "not moved: that must be asked for"
     if name == "process" and any(f.name == "shapes" and f.passed is False for f in findings):
         return "a run refuses its samples"

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from madns_runtime.errors import MachineError
 from madns_runtime.hardware.contract import Device
-from madns_runtime.hardware.framing import FRAMERS, LineFramer
+from madns_runtime.hardware.framing import FRAMERS, make_framer
 from madns_runtime.hardware.kind_registry import DeviceProgram
 from madns_runtime.hardware.verification.driver import held
 from madns_runtime.hardware.verification.order import (
@@ -30,6 +30,8 @@ from madns_runtime.hardware.verification.order import (
 )
 
 GARBAGE_BYTES: Final = 1 << 20
+CONTENT: Final = b"0123456789"
+"""Of a frame."""
 
 
 @contextlib.contextmanager
@@ -69,8 +71,18 @@ def _feed(fd: int, frame: bytes, period_s: float) -> None:
 
 
 def _frame_of(program: DeviceProgram) -> bytes:
-    framing: Any = getattr(program.parameters, "framing", "lines")
-    return FRAMERS.get(framing, LineFramer)(1024).wrap(b"0123456789")
+    """Return a frame as its line brings it, of as many bytes as its input takes."""
+    parameters: Any = program.parameters
+    framing: Any = getattr(parameters, "framing", "")
+    sizes = (c.frame_bytes_max for c in program.channels if c.direction == "in" and c.is_frame)
+    frame_bytes_max = min(sizes, default=len(CONTENT))
+    framer = make_framer(
+        framing if framing in FRAMERS else "lines",
+        frame_bytes_max,
+        getattr(parameters, "length_bytes", 2),
+        getattr(parameters, "length_order", "little"),
+    )
+    return framer.wrap(CONTENT[:frame_bytes_max])
 
 
 def spoil_line(order: VerificationOrder) -> Findings:

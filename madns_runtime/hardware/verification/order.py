@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -90,12 +90,24 @@ def has_stand_in(order: VerificationOrder) -> bool:
     return order.parameters.get(PORT) == STAND_IN
 
 
+def may_write(order: VerificationOrder, kind: DeviceKind) -> bool:
+    """Tell whether outputs may move."""
+    return order.may_write or not kind.needs_hardware or has_stand_in(order)
+
+
 def make_program(order: VerificationOrder, port: str | None) -> DeviceProgram:
     """
-    Return the driver that is to be verified, on *port* if there is one.
+    Return the driver that is to be verified, on *port* if there is one; what it makes knows whether its outputs may move.
 
     Raises:
         MadnsError: The kind cannot be found, or its parameters are wrong.
     """
     parameters = dict(order.parameters) if port is None else {**order.parameters, PORT: port}
-    return prepare(order.kind, parameters, Path(order.directory))
+    program = prepare(order.kind, parameters, Path(order.directory))
+
+    def make() -> Device:
+        device = program.make()
+        device.may_move = may_write(order, program.kind)
+        return device
+
+    return replace(program, make=make)

@@ -6,7 +6,7 @@ import mmap
 import os
 import signal
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from time import monotonic, sleep
 from typing import Any, Final
@@ -96,13 +96,18 @@ class _DrivenDevice:
         """Lose the device in each way, and return what was seen."""
         header, manager, reactor = self._header, self._manager, self._reactor
         manager.start()
-        manager.watch(reactor, lambda event: None)
+        events: list[Mapping[str, Any]] = []
+        manager.watch(reactor, events.append)
         reactor.on_signal(signal.SIGCHLD, manager.reap)
         manager.reap()  # who has ended before that was listened to
         if self._until(lambda: header[page.STATE] == page.OPEN, 20.0) is None:
             manager.close()
+            whys = [str(event["why"]) for event in events if event.get("why")]
+            why = f": {whys[-1]}" if whys else ""
             return [
-                finding("process", False, "it was not open within 20 s", "opened by its process")
+                finding(
+                    "process", False, f"it was not open within 20 s{why}", "opened by its process"
+                )
             ]
         findings = self._lost_by(self._signal(signal.SIGKILL), "kill -9", RETURN_S_MAX)
         hang_s = self._hang_s + RETURN_S_MAX
