@@ -81,6 +81,7 @@ def test_report_draws_the_cars_own_figures(cosmos, lockstep):
         assert title in text
 
 
+@pytest.mark.nightly
 @pytest.mark.process
 def test_comparison_tells_of_cars_what_their_simulation_knows(cosmos, lockstep):
     slow = ("--set", "parameters.driver.desired_speed_m_s=6", "--no-report")

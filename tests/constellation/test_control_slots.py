@@ -161,6 +161,7 @@ def test_slot_keeping_with_burns_of_the_wrong_sign_scatters_the_ring():
     assert slot_error_deg(fleet.states) > 0.3
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_drag_phasing_brings_the_ring_to_even_spacing_without_propellant():
     fleet = drag_keepers()

@@ -189,6 +189,7 @@ def test_full_disk_of_a_board_does_not_keep_its_records(tower8, tmp_path):
     assert not run.lies_on("pi01")
 
 
+@pytest.mark.nightly
 def test_read_only_disk_of_a_board_gives_its_records_and_keeps_them(tower8, tmp_path):
     run = BoardRun(tmp_path, tower8, boards=2)
     tower8.fault("pi01", "ro")

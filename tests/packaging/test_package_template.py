@@ -68,6 +68,7 @@ def test_test_of_the_package_fails_on_what_is_not_declared(installed):
         streams.write_text(text)
 
 
+@pytest.mark.nightly
 def test_test_of_the_package_fails_where_no_run_comes_to_its_end(installed):
     source, target = installed
     host = target / "my_rovers" / "host.py"

@@ -192,6 +192,7 @@ def test_an_agent_goes_on_alone_whose_fork_comes_back_from_the_call(tmp_path, ev
     assert not (tmp_path / "stepped_by_a_fork").exists()  # by the other agent of the process
 
 
+@pytest.mark.nightly
 def test_an_agent_goes_on_alone_whose_fork_comes_back_as_it_is_made(tmp_path):
     (tmp_path / "fork_as_it_is_made").touch()
     result = run(tmp_path, "good", "agents.per_process=2", SOME)
@@ -240,6 +241,7 @@ def test_a_call_that_holds_the_host_is_told_with_its_time(tmp_path):
     assert any(words in remark for remark in result["remarks"])
 
 
+@pytest.mark.nightly
 def test_no_page_of_a_host_is_left(tmp_path):
     before = set(FOLDER.glob(f"{PREFIX}*"))
     run(tmp_path, "timer_exit")

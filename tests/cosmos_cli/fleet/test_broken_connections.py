@@ -171,6 +171,7 @@ def test_agent_that_dies_while_the_connection_is_broken_is_told_afterwards(
     assert boards.talk.count("agent-01 is lost") == 1
 
 
+@pytest.mark.nightly
 def test_connection_that_does_not_come_back_in_time_loses_the_machine(
     boards: BoardsOverSsh,
 ) -> None:

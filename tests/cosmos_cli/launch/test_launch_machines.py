@@ -371,6 +371,7 @@ def test_flight_computer_of_a_board_that_was_lost_is_started_anew_with_it(fleet:
     assert_untouched(fleet.directory, "agent-04", "agent-01", has_computer=False)
 
 
+@pytest.mark.nightly
 def test_detached_run_is_seen_and_ended_from_another_folder(fleet: Fleet, tmp_path: Path) -> None:
     fleet.start("--detach")
     code = fleet.finish()

@@ -144,6 +144,7 @@ def age(environment_or_path, days):
     os.utime(environment_or_path, (then_s, then_s))
 
 
+@pytest.mark.nightly
 def test_cache_forgets_what_was_not_used_for_long_when_something_new_comes(index, tmp_path):
     locks, wheels = tmp_path / "cache/locks", tmp_path / "cache/wheels"
     make_wheel(index, "pyproj")
@@ -164,6 +165,7 @@ def test_cache_forgets_what_was_not_used_for_long_when_something_new_comes(index
     assert prepare(PI, ["pyproj"]).key == old.key
 
 
+@pytest.mark.nightly
 def test_wheels_that_a_new_environment_takes_from_the_cache_are_kept_while_it_is_made(
     index, tmp_path, monkeypatch
 ):

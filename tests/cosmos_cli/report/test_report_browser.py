@@ -154,6 +154,7 @@ def test_page_shows_what_a_run_said_and_does_nothing_of_it(hostile_page):
     assert int(told["shown"]) >= 8
 
 
+@pytest.mark.nightly
 def test_a_comparisons_figures_draw_too(tmp_path):
     marks = [Series(x=[0.0, 1.0], y=[1.0, 2.0], name=HOSTILE)]
     figure = Figure(title=HOSTILE, choices=[FigureChoice(marks=marks)])

@@ -380,6 +380,7 @@ def test_a_run_keeps_a_copy_of_what_it_flew_and_packages_it(braked):
         ).read_bytes()
 
 
+@pytest.mark.nightly
 def test_the_copy_flies_whatever_todays_files_are_and_without_it_they_are_named(changed):
     cosmos, copy = changed
 

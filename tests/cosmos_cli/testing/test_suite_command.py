@@ -100,6 +100,7 @@ def test_a_suite_tells_each_test_keeps_failures_and_runs_them_again(cosmos):
     assert (others.returncode, "none of these failed last time" in others.stderr) == (0, True)
 
 
+@pytest.mark.nightly
 def test_a_seed_that_failed_is_run_again_alone(cosmos):
     cosmos.environment["COSMOS_INVENTORY"] = "none.yaml"  # tests run here, whatever it names
     scenario(cosmos, "s", expect={"verdict": "nothing says this"})
